@@ -15,10 +15,11 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    import asyncio
+    from collections.abc import Callable, Iterator
 
 _ENOUGH = 1 << 20
 _log = logging.getLogger(__name__)
@@ -38,6 +39,38 @@ def end_signals() -> tuple[signal.Signals, ...]:
     """
     ends = (signal.SIGINT, signal.SIGTERM)
     return ends if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (*ends, signal.SIGHUP)
+
+
+class EndSignals:
+    """Cancels the task of a program at the first signal that tells it to end.
+
+    Args:
+        task: The task.
+        again: Called at each later signal: a second cancellation would interrupt the end of the program.
+
+    Attributes:
+        came: Whether a signal has come. The task itself cannot be asked: it also says that it is being
+            cancelled while a timeout in it ends, and goes on after that.
+    """
+
+    def __init__(self, task: asyncio.Task[Any], again: Callable[[], object] = lambda: None) -> None:
+        self.came = False
+        self._task = task
+        self._again = again
+
+    def handle(self) -> None:
+        """Take the signals from now on."""
+        loop = self._task.get_loop()
+        for number in end_signals():
+            loop.add_signal_handler(number, self.take)
+
+    def take(self) -> None:
+        """Do what a signal asks for."""
+        if self.came:
+            self._again()
+        else:
+            self.came = True
+            self._task.cancel()
 
 
 def open_missing_streams() -> None:

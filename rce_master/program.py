@@ -22,7 +22,7 @@ from rce.config import (
     log_as,
     read_store_address,
 )
-from rce.own_process import end_signals, raise_file_limit
+from rce.own_process import EndSignals, raise_file_limit
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
 from rce_master.exceptions import MasterError
@@ -90,21 +90,13 @@ async def _run(settings: MasterSettings, secret: Secret) -> None:
     """Run until SIGINT or SIGTERM."""
     task = asyncio.current_task()
     assert task is not None
-
-    is_stopping = asyncio.Event()
-
-    def stop() -> None:
-        is_stopping.set()
-        if not task.cancelling():  # a second cancellation would interrupt the shutdown
-            task.cancel()
-
-    for number in end_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop)
+    signals = EndSignals(task)
+    signals.handle()
     if settings.etcd is not None:
         from rce_master.replicated import ReplicatedMaster  # loads aiohttp's client
 
         with contextlib.suppress(asyncio.CancelledError):
-            await ReplicatedMaster(settings, secret).run(_announce, _announce_standby, is_stopping.is_set)
+            await ReplicatedMaster(settings, secret).run(_announce, _announce_standby, lambda: signals.came)
         return
     store = await SqliteStore.open(settings.state_dir)
     try:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import uvloop
 
 from rce.aio.tasks import errors_in
-from rce.own_process import end_signals
+from rce.own_process import EndSignals, end_signals
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import Prepared, prepare
 from rce.supervision.supervisor import StartError, Supervisor
@@ -30,12 +30,7 @@ async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
     task = asyncio.current_task()
     assert task is not None
     supervisor = Supervisor(plan.programs, _say, prepared)
-
-    def stop() -> None:
-        supervisor.hurry() if task.cancelling() else task.cancel()
-
-    for number in end_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop)
+    EndSignals(task, again=supervisor.hurry).handle()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, end_signals())
     for line in plan.warnings:
         _complain(line)

@@ -15,6 +15,7 @@ from rce.supervision.process import Child
 
 RESTARTS = RestartPolicy(Backoff(first=0.2, longest=5.0), stable_s=10.0)
 READY_TIMEOUT_S = 60.0
+_LOOK_AGAIN_S = 1.0
 
 
 class StartError(Exception):
@@ -129,9 +130,11 @@ class Supervisor:
 async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:
     """Cancel tasks one after the other, the last one first."""
     for task in reversed(tasks):
-        if not task.cancelling():  # a second cancellation would interrupt the end of its program
-            task.cancel()
-        await asyncio.wait([task])
+        while not task.done():
+            if not task.cancelling():  # a second cancellation would interrupt the end of its program
+                task.cancel()
+            # Of a timeout that ends in a task, the task says for a moment that it is being cancelled.
+            await asyncio.wait([task], timeout=_LOOK_AGAIN_S)
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:

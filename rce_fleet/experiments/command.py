@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rce.own_process import end_signals
+from rce.own_process import EndSignals, end_signals
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.catalogue import experiments_of
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
@@ -190,13 +190,7 @@ async def _run(runner: Runner) -> None:
     task = asyncio.current_task()
     assert task is not None
     loop = asyncio.get_running_loop()
-
-    def interrupt() -> None:
-        if not task.cancelling():  # a second Ctrl-C does not stop the removal of what was made
-            task.cancel()
-
-    for number in end_signals():
-        loop.add_signal_handler(number, interrupt)
+    EndSignals(task).handle()  # a second Ctrl-C does not stop the removal of what was made
     try:
         await runner.run()
     finally:

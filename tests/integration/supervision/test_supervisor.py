@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import sys
@@ -16,7 +17,7 @@ from support.engine import until
 from rce.supervision.final import FinalCommand
 from rce.supervision.plan import Program
 from rce.supervision.process import Child
-from rce.supervision.supervisor import StartError, Supervisor
+from rce.supervision.supervisor import StartError, Supervisor, _end
 
 READY = "import time; print('x ready: now', flush=True); time.sleep(1000)"
 
@@ -215,3 +216,22 @@ async def test_final_command_runs_after_its_waiter_was_killed(tmp_path: Path) ->
     async with asyncio.timeout(60):
         assert await final.run() == 0
     assert (tmp_path / "note").exists()
+
+
+async def test_a_program_in_whose_pause_the_end_begins_is_ended() -> None:
+    """The pause has just ended, and the program is about to be started again."""
+    ending: list[asyncio.Task[None]] = []
+
+    async def keep() -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0):
+                ending.append(asyncio.create_task(_end([task])))
+                await asyncio.Event().wait()
+        await asyncio.Event().wait()
+
+    kept = asyncio.create_task(keep())
+    await asyncio.wait([kept], timeout=60)
+    assert kept.cancelled()
+    await ending[0]
