@@ -45,7 +45,7 @@ class Traces:
 
     def __init__(self, folder: Path, *words: str) -> None:
         self._folder = folder
-        self._needles = [os.fsencode(folder), *map(str.encode, words)]
+        self._words = [word.encode() for word in words]
         self._seen: dict[int, int] = {}
         """Start times by pid."""
         self._marks: set[str] = set()
@@ -98,11 +98,14 @@ class Traces:
                     self._tokens.add(path.read_text())
 
     def _is_ours(self, pid: int) -> bool:
-        needles = [*self._needles, *(f"{proc.MARK}={mark}".encode() for mark in self._marks)]
-        for name in ("cmdline", "environ"):
+        if pid == os.getpid():
+            return False
+        in_both = [os.fsencode(self._folder), *(f"{proc.MARK}={mark}".encode() for mark in self._marks)]
+        # Numbers of other programs' environments, such as systemd's JOURNAL_STREAM, may contain a word.
+        for name, needles in (("cmdline", [*in_both, *self._words]), ("environ", in_both)):
             with contextlib.suppress(OSError):
                 text = Path(f"/proc/{pid}/{name}").read_bytes()
-                if pid != os.getpid() and any(needle in text for needle in needles):
+                if any(needle in text for needle in needles):
                     return True
         return False
 
