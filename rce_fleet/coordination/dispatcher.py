@@ -268,6 +268,7 @@ class Dispatcher:
             return False
         if record.pose_only and not is_standing:
             index = max(index - 1, 0)
+        index = min(index, self._target_index(record, granted))
         hull = self._placement.hull(record) if index else set()
         while index and granted[index - 1] in hull:
             index -= 1  # It cuts a corner, and is still partly in the cell before.
@@ -280,6 +281,16 @@ class Dispatcher:
             still = extra and extra & self._placement.hull(record)
             self.state.ledger.arrive(record.id, index, still)
         return True
+
+    def _target_index(self, record: RobotRecord, granted: list[int]) -> int:
+        """Return the index of the cell that a robot's move client drives it to; the last if it says none.
+
+        A robot that was pushed along its path drives back to that cell.
+        """
+        report, last = record.report, len(granted) - 1
+        if report is None or report.state is not ClientState.DRIVING or report.target not in granted:
+            return last
+        return granted.index(report.target)
 
     def has_left(self, record: RobotRecord) -> bool:
         """Return whether a robot that is not on its path was carried out of its granted cells."""

@@ -208,6 +208,8 @@ class FleetPlanner:
             if record.phase is Phase.ACTIVE:
                 self._dispatcher.hold(record, "its move client was restarted")
             self._deadlines.hasten(record.id, self._now)
+        if record.phase is Phase.ACTIVE and known is not None and known.target != report.target:
+            self._dispatcher.arrive(record)
 
     def _expect(self, event: RobotsExpected) -> None:
         """Wait for robots before any cell is granted, and claim the cells that they may be in."""
