@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from math import cos, floor, isfinite, sin
+from math import cos, floor, inf, isfinite, sin
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -44,10 +44,10 @@ class GridMap:
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
             raise ValueError(f"a map needs at least one row and one column, not {self.rows} x {self.columns}")
-        if not self.cell_size > 0:
-            raise ValueError(f"cell_size must be positive, not {self.cell_size}")
-        if not isfinite(self.yaw):
-            raise ValueError(f"yaw must be a finite number, not {self.yaw}")
+        if not 0 < self.cell_size < inf:
+            raise ValueError(f"cell_size must be a positive number, not {self.cell_size}")
+        if not all(map(isfinite, (*self.origin, self.yaw))):
+            raise ValueError(f"origin and yaw must be finite numbers, not {self.origin} and {self.yaw}")
         size = len(self)
         outside = [cell for cell in self.blocked if not 0 <= cell < size]
         if outside:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, sqrt
+from math import inf, nan, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -69,10 +69,16 @@ def test_a_disc_touches_what_it_overlaps() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"rows": 0}, {"cell_size": 0.0}, {"cell_size": float("nan")}, {"blocked": frozenset({64})}]
+    "arguments",
+    [
+        {"rows": 0},
+        *({"cell_size": size} for size in (0.0, nan, inf)),
+        *({"origin": origin} for origin in ((nan, 0.0), (0.0, -inf))),
+        {"blocked": frozenset({64})},
+    ],
 )
 def test_impossible_maps_are_refused(arguments: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"row|cell_size|blocked"):
+    with pytest.raises(ValueError, match=r"row|cell_size|blocked|origin"):
         GridMap(**arguments)  # type: ignore[arg-type]  # impossible ones too
 
 
