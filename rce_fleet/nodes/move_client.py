@@ -206,7 +206,7 @@ class MoveClientNode:
         try:
             self._do(self._client.take_cells(revision, list(message.data), self._node.time()))
         except ValueError as error:
-            self._node.log.warning("the list of cells was refused: %s", error)
+            self._throttled_log.warn("list", f"the list of cells was refused: {error}")
 
     def _limit_speed(self, speed: float) -> None:
         """Tell the robot the greatest speed in its cells; 0 m/s means that it is not limited any more."""

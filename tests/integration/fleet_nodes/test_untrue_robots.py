@@ -14,6 +14,7 @@ from support.resting_robot import PACKAGES, STATUS, RestingRobot, fleet_program
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import Message, TypeRegistry
+from rce_fleet.nodes.throttled_log import EVERY
 
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 
@@ -81,3 +82,19 @@ async def test_messages_that_no_robot_sends_disturb_no_other(fleet: Fleet) -> No
     answer = await fleet.ask(cell=9)
     assert answer.ok, answer.message
     await fleet.good.until("arrived", 9)
+
+
+async def test_a_flood_of_lists_that_are_no_paths_is_told_of_once(fleet: Fleet) -> None:
+    """Each warning would go to all who read the log. The robot drives as before."""
+    await fleet.good.until("idle")
+    lists = await fleet.liar.advertise("/Good/goalNodesList", "std_msgs/Int32MultiArray", latch=True)
+    lists.publish(data=[0, 5])
+    await fleet.hears("the list of cells was refused: [0, 5] is not a path on the map")
+    began = asyncio.get_running_loop().time()
+    for cell in range(1000):
+        lists.publish(data=[cell % 64, (cell + 5) % 64])
+    await fleet.ask(cell=9)
+    await fleet.good.until("arrived", 9)
+    took = asyncio.get_running_loop().time() - began
+    said = [fleet.heard.get_nowait() for _ in range(fleet.heard.qsize())]
+    assert sum("was refused" in text for text in said) <= 1 + took / EVERY
