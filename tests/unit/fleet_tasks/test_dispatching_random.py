@@ -1,4 +1,4 @@
-"""Restarts, holds, cancellations, lost robots and blocked cells at random moments: no task is lost."""
+"""Restarts, holds, cancellations, lost robots, blocked cells, steps of the clock: no task is lost."""
 
 from __future__ import annotations
 
@@ -38,6 +38,10 @@ class Shift:
             robot.away_since = float("inf") if is_away else floor.now
         elif what == "block":
             self.block(8 + first + second)
+        elif what == "clock":
+            step = 600.0 * (1 + first)
+            floor.now += step
+            floor.facts.skip(step, floor.now)
         elif still_open:
             task = floor.task(still_open[first % len(still_open)])
             if task.state is not TaskState.CANCELLING:
@@ -60,7 +64,7 @@ class Shift:
 
 
 _THINGS = st.tuples(
-    st.sampled_from(["post", "post", "hold", "resume", "cancel", "restart", "lose", "block"]),
+    st.sampled_from(["post", "post", "hold", "resume", "cancel", "restart", "lose", "block", "clock"]),
     st.integers(0, 22),
     st.integers(0, 22),
     st.integers(1, 40),
@@ -70,7 +74,7 @@ _THINGS = st.tuples(
 @settings(max_examples=20, deadline=None)
 @given(st.lists(_THINGS, min_size=5, max_size=25))
 def test_no_task_is_lost_or_done_twice(things: list[tuple[str, int, int, int]]) -> None:
-    """Restarts, holds, cancellations, silence and blocked cells at random moments."""
+    """Restarts, holds, cancellations, silence, blocked cells and steps of the clock at random moments."""
     shift = Shift()
     for what, first, second, seconds in things:
         shift.happen(what, first, second)
@@ -79,6 +83,7 @@ def test_no_task_is_lost_or_done_twice(things: list[tuple[str, int, int, int]]) 
     for task in map(shift.floor.task, shift.tasks):
         assert task.state in (TaskState.DONE, TaskState.CANCELLED)
         assert task.loads == 0
+        assert task.reason, "each end has a reason"
         stops = [visit.stop for visit in task.visits]
         assert task.state is TaskState.CANCELLED or stops == [0, 1]
         assert len(set(stops)) == len(stops)
@@ -122,6 +127,6 @@ def test_people_can_end_each_task_whatever_happened(things: list[tuple[str, int,
         if task.is_loaded and not task.has_ended and task.action is None:
             settle_load(floor.book, task.id, None, floor.now)
     floor.run(1)
-    assert all(floor.task(task).has_ended for task in shift.tasks)
+    assert all(floor.task(task).has_ended and floor.task(task).reason for task in shift.tasks)
     assert all(floor.book.task_of(name) is None for name in NAMES)
     assert floor.dispatcher.goals() == dict.fromkeys(NAMES)
