@@ -46,12 +46,14 @@ def crossing(robot: Sequence[Point], cloud: Sequence[Point]) -> float | None:
         cloud: Points in rising order.
 
     Returns:
-        The value within the range of ``cloud``; None if the curves do not cross there.
+        The value within the range of ``cloud``; None if the curves do not cross there, or are the same.
     """
     if not cloud:
         return None
     places = {point.at for point in (*robot, *cloud) if cloud[0].at <= point.at <= cloud[-1].at}
     apart = [(at, _value(cloud, at) - _value(robot, at)) for at in sorted(places)]
+    if len(apart) > 1 and not any(difference for _, difference in apart):
+        return None
     for (before, first), (after, second) in pairwise(apart):
         if first == 0:
             return before
@@ -65,8 +67,9 @@ def crossing_text(robot: Sequence[Point], cloud: Sequence[Point], unit: str) -> 
     found = crossing(robot, cloud)
     if found is not None:
         return f"{number(found)} {unit}"
-    better = "cloud" if cloud[0].median < _value(robot, cloud[0].at) else "robot"
-    return f"none within the measured range ({better} is better)"
+    there, here = cloud[0].median, _value(robot, cloud[0].at)
+    better = "both are equal" if there == here else f"{'cloud' if there < here else 'robot'} is better"
+    return f"none within the measured range ({better})"
 
 
 def crossing_table(measurements: Measurements, experiment: str) -> str:

@@ -42,6 +42,7 @@ def test_without_a_crossing_the_better_place_is_told() -> None:
     assert crossing_text(ROBOT, cloud, "ms") == "none within the measured range (cloud is better)"
     assert crossing_text([Point(5, 1.0)], cloud, "ms") == "none within the measured range (robot is better)"
     assert crossing_text([Point(5, 6.5)], cloud, "ms") == "25.0 ms"
+    assert crossing_text(cloud, cloud, "ms") == "none within the measured range (both are equal)"
 
 
 def test_the_table_has_each_task_and_metric_over_each_factor() -> None:
