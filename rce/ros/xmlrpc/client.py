@@ -204,6 +204,8 @@ class RpcClient:
         """Continue with other requests when those of a group are done with."""
         if work.cancelled():  # the callers have gone, or the client is closed
             _fail(group, RpcUnreachableError, "the client is closed")
+        elif (error := work.exception()) is not None:  # an unexpected one, which is reported too
+            _fail(group, RpcUnreachableError, repr(error), error)
         server.busy -= 1
         self._begin(server)
 
@@ -342,7 +344,7 @@ def _fail(
     group: list[RpcRequest],
     error: type[RpcUnreachableError],
     reason: str,
-    cause: Exception | None = None,
+    cause: BaseException | None = None,
 ) -> None:
     for request in group:
         request.fail(error(request.uri, reason), cause)

@@ -16,6 +16,7 @@ from support.ros_masters import serving
 from rce.dialing import connect_first
 from rce.ros.errors import RpcRefusedError, RpcUnreachableError
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, batches, client
+from rce.ros.xmlrpc.client_connection import ClientConnection
 from rce.ros.xmlrpc.codec import encode_call
 
 
@@ -186,6 +187,25 @@ async def test_closed_client_fails_what_waits() -> None:
                 await call
         with pytest.raises(RpcUnreachableError, match="client is closed"):
             await rpc.call(uri, "get", ("/a",))
+
+
+async def test_unexpected_error_ends_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as one of the event loop's transport; the call does not wait for its time to be over."""
+
+    async def fail(*_: object) -> bytes:
+        raise RuntimeError("the handler is closed")
+
+    found: list[str] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: found.append(str(context["exception"])))
+    async with RpcClient() as rpc, server() as one, asyncio.timeout(60):
+        uri = f"http://127.0.0.1:{one.port}/"
+        monkeypatch.setattr(ClientConnection, "post", fail)
+        with pytest.raises(RpcUnreachableError, match="the handler is closed"):
+            await rpc.call(uri, "get", ("/a",), timeout=600)
+        monkeypatch.undo()
+        assert (await rpc.call(uri, "get", ("/a",)))[0] == 1
+    assert found == ["the handler is closed"]
 
 
 @asynccontextmanager
