@@ -110,6 +110,7 @@ class Registration:
         self._unregister = unregister
         self._is_needed = is_needed
         self._lock = lock
+        self._is_taken_back = False
         self._task: asyncio.Task[Exception | None]
 
     def start(self, tasks: TaskScope, register: MasterCall) -> None:
@@ -141,8 +142,10 @@ class Registration:
             MasterError: The master does not take it.
         """
         async with self._lock:
-            if not self._is_needed():
+            # A node that leaves waits for what is being taken back in the background.
+            if not (self._is_taken_back or self._is_needed()):
                 await self._unregister()
+                self._is_taken_back = True
 
     async def _register(self, register: MasterCall) -> Exception | None:
         """Return the error instead of raising it: every handle gets it, and the node continues."""
