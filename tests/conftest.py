@@ -27,7 +27,7 @@ REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_TIMEOUT_S = 3.0
 RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
 """Environment variable for :mod:`support.roscpp_programs`: the folder of what all workers of a run share."""
-WORKERS_PER_CORE = 3.0
+WORKERS_PER_CORE = 2.5
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
 hypothesis.settings.register_profile(
@@ -304,7 +304,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return how many tests run at once: most wait for processes and the clock half of their time."""
+    """Return how many tests run at once: most wait for processes and the clock much of their time."""
     return int(WORKERS_PER_CORE * len(os.sched_getaffinity(0)))
 
 
