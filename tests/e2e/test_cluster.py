@@ -58,8 +58,10 @@ async def main(authority, password, *urls):
                 ) as reply:
                     if reply.status == 201:
                         print(f"acknowledged robot{number}", flush=True)
-            except (aiohttp.ClientError, TimeoutError, OSError):
-                pass
+                    else:
+                        print(url, reply.status, (await reply.text())[:200], flush=True)
+            except (aiohttp.ClientError, TimeoutError, OSError) as error:
+                print(url, repr(error), flush=True)
             await asyncio.sleep(0.2)
 
 asyncio.run(main(*sys.argv[1:]))
@@ -150,6 +152,11 @@ class Host:
             assert program is not None
             await program.kill()
 
+    def show(self) -> None:
+        """Print what its programs have said, for the report of a test that failed."""
+        for log in sorted(self.folder.glob("*.log")):
+            print(f"--- {log.name}\n{log.read_text(errors='replace')[-20_000:]}")  # noqa: T201 - pytest shows it
+
     async def end(self) -> None:
         for program in (self.master, self.etcd):
             if program is not None and program.running:
@@ -163,7 +170,12 @@ async def hosts(folder: Path, count: int) -> AsyncIterator[list[Host]]:
         async with AsyncExitStack() as stack:
             for host in made:
                 stack.push_async_callback(host.end)
-            yield made
+            try:
+                yield made
+            except AssertionError:
+                for host in made:
+                    host.show()
+                raise
 
 
 async def give_certificate(first: Host, other: Host) -> None:
