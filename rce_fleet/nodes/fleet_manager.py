@@ -36,7 +36,7 @@ from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
-from rce_fleet.nodes.standby import stand_by, successor
+from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.tasks.records import Places, Zone
@@ -312,10 +312,7 @@ def open_journal(given: str) -> Journal:
 
 async def main() -> int:
     """Run the manager until the node is stopped; return the program's exit code."""
-    code = None
-    while code is None:
-        code = await serve()
-    return code
+    return await serve_in_turn(serve)
 
 
 async def serve() -> int | None:

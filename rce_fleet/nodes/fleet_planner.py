@@ -47,7 +47,7 @@ from rce_fleet.nodes.plan_worker import PlanWorker
 from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
-from rce_fleet.nodes.standby import stand_by, successor
+from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.state_publisher import StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
@@ -319,10 +319,7 @@ def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
 
 async def main() -> int:
     """Run the planner until the node is stopped; return the program's exit code."""
-    code = None
-    while code is None:
-        code = await serve()
-    return code
+    return await serve_in_turn(serve)
 
 
 async def serve() -> int | None:

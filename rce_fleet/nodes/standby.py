@@ -15,6 +15,8 @@ from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rce.ros.node import Node
     from rce_fleet.nodes.graph_look import GraphState
 
@@ -22,6 +24,19 @@ _LOOK_EVERY = 1.0
 """Seconds between two looks for another program."""
 _PROBE_S = 2.0
 """Seconds in which a running program accepts a connection."""
+
+
+async def serve_in_turn(serve: Callable[[], Awaitable[int | None]]) -> int:
+    """Run a program until it ends; return its exit code.
+
+    Args:
+        serve: Runs it once, with a node of its own; returns the exit code, or None if another program has
+            taken over, so that this one is to stand by.
+    """
+    code = None
+    while code is None:
+        code = await serve()
+    return code
 
 
 async def stand_by(node: Node, program: str, service: str) -> bool:
