@@ -89,7 +89,7 @@ def read_client_state(text: str) -> ClientState:
     """Return the state that a move client reports.
 
     Raises:
-        ValueError: There is no such state.
+        ValueError: The state is unknown.
     """
     known = {state.value: state for state in ClientState}
     if text not in known:

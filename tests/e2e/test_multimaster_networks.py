@@ -189,7 +189,7 @@ async def test_a_real_master_with_rospy_survives_a_network_drop(folder: Path) ->
 
 
 async def test_relay_needs_one_connection_only(folder: Path) -> None:
-    """Cores and nodes have addresses that nobody but their own machine knows a way to, as behind a NAT."""
+    """Cores and nodes have addresses to which only their own machine knows a way, as behind a NAT."""
     async with machines(2, folder) as (robot, cloud):
         for machine, private in ((robot, "10.99.1.1"), (cloud, "10.99.2.1")):
             machine.place.add_private_address(private)

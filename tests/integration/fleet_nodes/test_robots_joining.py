@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 from support.ros_masters import serving
+from support.ros_requests import count_requests
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterRefusedError
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.ros.xmlrpc import Dispatcher
 from rce_fleet.coordination.events import Event, PoseSeen
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
@@ -36,14 +36,7 @@ async def planner(master_uri: str, take: list[Event]) -> AsyncIterator[tuple[Nod
 
 async def test_robots_are_joined_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a request for each topic, robots stood still for a minute after the planner was killed."""
-    requests: list[int] = []
-    respond = Dispatcher.respond
-
-    def count(self: Dispatcher, document: bytes) -> bytes:
-        requests.append(len(document))
-        return respond(self, document)
-
-    monkeypatch.setattr(Dispatcher, "respond", count)
+    requests = count_requests(monkeypatch)
     names = [f"Robot{number}" for number in range(2 * ROBOTS_AT_ONCE)]
     async with Core(port=0) as core, planner(core.uri, []) as (node, robots), asyncio.timeout(120):
         before = len(requests)

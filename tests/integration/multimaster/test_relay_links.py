@@ -132,7 +132,7 @@ async def test_a_link_brings_messages_only_while_there_is_a_subscriber() -> None
         await heard.close()
         async with asyncio.timeout(60):
             while said.connections:
-                said.publish(data="nobody listens")
+                said.publish(data="not listened to")
                 await asyncio.sleep(0.02)
 
 
@@ -141,7 +141,7 @@ async def test_link_keeps_what_each_publisher_latched() -> None:
         await check_that_all_that_is_latched_is_heard(robot, cloud.uri, ("/tf_static", "/tf_static"))
 
 
-async def test_link_forgets_what_nobody_listens_to() -> None:
+async def test_link_forgets_what_has_no_listener() -> None:
     """A later subscriber gets what is latched then, and not what was at the last subscription."""
     async with linked() as (cloud, robot, one, _), node("base", robot.uri) as base:
         publisher = await base.advertise("said", STRING, latch=True)

@@ -70,7 +70,7 @@ async def test_relay_keeps_what_each_publisher_latched(core: Core) -> None:
         await check_that_all_that_is_latched_is_heard(core, core.uri, ("/from", "/to"))
 
 
-async def test_lazy_relay_forgets_what_nobody_listens_to(core: Core) -> None:
+async def test_lazy_relay_forgets_what_has_no_listener(core: Core) -> None:
     async with relaying(core, TopicRelay("from", "to", lazy=True)), node("talker", core.uri) as talker:
         publisher = await talker.advertise("from", STRING, latch=True)
         publisher.publish(data="old")
@@ -96,7 +96,7 @@ async def test_a_lazy_relay_listens_only_while_it_has_a_subscriber(core: Core) -
             assert (await published_until_heard(publisher, heard, data=word)).data == word
             await heard.close()
             while publisher.connections:
-                publisher.publish(data="nobody listens")
+                publisher.publish(data="not listened to")
                 await asyncio.sleep(0.02)
 
 

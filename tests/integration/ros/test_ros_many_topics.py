@@ -6,9 +6,10 @@ import asyncio
 
 import pytest
 from support.ros_nodes import MakeNode
+from support.ros_requests import count_requests
 
 from rce.ros.core import Core
-from rce.ros.xmlrpc import Dispatcher, RpcServer, server
+from rce.ros.xmlrpc import RpcServer, server
 from rce.ros.xmlrpc.client import MAX_CONNECTIONS
 
 STRING = "std_msgs/String"
@@ -18,15 +19,7 @@ MANY = 400
 @pytest.fixture
 def requests(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The length of each XML-RPC request to a server of this process."""
-    lengths: list[int] = []
-    respond = Dispatcher.respond
-
-    def count(self: Dispatcher, document: bytes) -> bytes:
-        lengths.append(len(document))
-        return respond(self, document)
-
-    monkeypatch.setattr(Dispatcher, "respond", count)
-    return lengths
+    return count_requests(monkeypatch)
 
 
 @pytest.mark.parametrize("first", ["publishers", "subscribers"])

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from support.ros_requests import count_requests
 
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.ros.xmlrpc import Dispatcher
 from rce_fleet.drivers.light_driver import LightDriver
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.light.robots import LightRobots
@@ -53,14 +53,7 @@ async def test_light_robots_obey_stops_and_hands() -> None:
 
 async def test_topics_of_many_robots_are_registered_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """A world of a thousand robots was ready after nine thousand of them, one after the other."""
-    requests: list[int] = []
-    respond = Dispatcher.respond
-
-    def count(self: Dispatcher, document: bytes) -> bytes:
-        requests.append(len(document))
-        return respond(self, document)
-
-    monkeypatch.setattr(Dispatcher, "respond", count)
+    requests = count_requests(monkeypatch)
     poses = {f"Robot{number}": Pose(0, 5.0 * number, 0) for number in range(100)}
     robots = LightRobots(poses, np.empty((0, 4)))
     async with (
