@@ -14,6 +14,7 @@ from rce.own_process import EndSignals
 
 async def test_first_signal_cancels_and_later_ones_hurry() -> None:
     hurried = 0
+    begun = asyncio.Event()
 
     def hurry() -> None:
         nonlocal hurried
@@ -21,6 +22,7 @@ async def test_first_signal_cancels_and_later_ones_hurry() -> None:
 
     async def work() -> None:
         try:
+            begun.set()
             await asyncio.Event().wait()
         finally:
             while hurried < 2:  # a second cancellation would end this
@@ -30,10 +32,12 @@ async def test_first_signal_cancels_and_later_ones_hurry() -> None:
     signals = EndSignals(task, again=hurry)
     signals.handle()
     try:
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
-            await asyncio.sleep(0.01)
-            os.kill(os.getpid(), number)
         async with asyncio.timeout(60):
+            await begun.wait()
+            for sent, number in enumerate((signal.SIGTERM, signal.SIGINT, signal.SIGTERM)):
+                os.kill(os.getpid(), number)
+                while signals.came + hurried <= sent:
+                    await asyncio.sleep(0.01)
             with pytest.raises(asyncio.CancelledError):
                 await task
     finally:
