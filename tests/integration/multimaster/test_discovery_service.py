@@ -212,13 +212,13 @@ async def test_robot_hosts_find_each_other_without_multicast(network: DiscoveryN
 
 async def test_a_robot_host_may_be_a_name(network: DiscoveryNetwork, tmp_path: Path) -> None:
     """uvloop's sockets send to addresses only; a name that cannot be resolved is told of and does no harm."""
-    (port,) = free_ports(1)
+    port, rpc_port = free_ports(2)
     async with Core(port=0) as a, Core(port=0) as b:
         settings = network.settings(b.uri, name="b", mcast_port=port, send_mcast=False, listen_mcast=False)
         running = program(
             "discovery",
             *("--master-uri", a.uri, "--name", "a", "--heartbeat-hz", "10", "--no-listen-mcast"),
-            *("--no-send-mcast", "--mcast-group", "226.0.0.0@127.0.0.1"),
+            *("--no-send-mcast", "--mcast-group", "226.0.0.0@127.0.0.1", "--rpc-port", str(rpc_port)),
             *("--mcast-port", str(network.port), "--robot-host", f"localhost:{port}"),
             *("--robot-host", "no-such-robot.invalid"),
             folder=tmp_path,

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from support.engine import Program
 from support.multimaster import STRING, DiscoveryNetwork, node, process, ros_environment
+from support.ports import free_port
 
 from rce.ros.core import Core
 from rce.ros.multimaster.discovery import Discovery
@@ -52,7 +53,16 @@ async def test_fkie_hears_our_discovery(network: DiscoveryNetwork, tmp_path: Pat
         ours = cli(
             "discovery",
             tmp_path,
-            *("--master-uri", core.uri, "--name", "ours", "--rpc-port", "0", "--heartbeat-hz", "10"),
+            *(
+                "--master-uri",
+                core.uri,
+                "--name",
+                "ours",
+                "--rpc-port",
+                str(free_port()),
+                "--heartbeat-hz",
+                "10",
+            ),
             *("--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(network.port)),
         )
         await ours.start(ready="")
