@@ -30,6 +30,9 @@ QUIET_TIME = 1.0
 STAMP_STEP = 1e-3
 """Seconds between two time stamps while the clock is behind the newest one."""
 
+RECALLED_S, RECALLED_FACTOR = 1.0, 60.0
+"""Seconds by which the next goal is made newer after the robot has recalled one, and how they grow."""
+
 LATEST_STAMP = 4.2e9
 """Seconds; a ROS time has 32 bits for them. Goals of others may have any time stamp."""
 
@@ -180,6 +183,7 @@ class MoveClient:
     started: float
     _report: ClientReport = field(default_factory=ClientReport)
     newest_stamp: float = float("-inf")
+    _ahead: float = RECALLED_S
     _now: float = float("-inf")
     _heading: float = 0.0
     _goal: SendGoal | None = None
@@ -342,6 +346,13 @@ class MoveClient:
 
     def _finished(self, state: GoalState, now: float) -> list[Instruction]:
         self._goal = None
+        if state is GoalState.RECALLED:
+            # A stop is newer than the goal: one by an earlier client, whose clock was ahead. Robots do not
+            # tell the time stamps of stops.
+            self.newest_stamp = min(max(now, self.newest_stamp) + self._ahead, LATEST_STAMP)
+            self._ahead *= RECALLED_FACTOR
+        else:
+            self._ahead = RECALLED_S
         if state is not GoalState.SUCCEEDED:
             self._advance(ClientEvent.FAIL)
             self._update(cells=(), reached=None, target=None)
