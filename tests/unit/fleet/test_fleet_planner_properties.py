@@ -70,9 +70,7 @@ def test_every_robot_arrives_within_its_own_cells(
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
-@example(
-    seed=2271760180, count=1
-)  # a client begins behind a stop that is newer than all goals
+@example(seed=2271760180, count=1)  # a client begins behind a stop that is newer than all goals
 def test_robots_stop_and_arrive_though_a_clock_jumps(
     make_fleet: type[SimulatedClients], seed: int, count: int
 ) -> None:
