@@ -143,6 +143,14 @@ class ManagerNode:
         )
         self._facts = FactKeeper(self._manager.facts)
         self._state_needed.set()
+        try:
+            await self._serve()
+        finally:
+            await self._manager.close()
+
+    async def _serve(self) -> None:
+        """Answer requests, and let tasks be done, until the node is stopped or replaced."""
+        node = self._node
         await self._set_places()
         router = Router(self._manager, [*TASK_ROUTES, *FLEET_ROUTES])
 
@@ -169,7 +177,6 @@ class ManagerNode:
                     others.append(tasks.create_task(compile_beside(node.log)))
             for other in others:
                 other.cancel()
-        await self._manager.close()
 
     async def _step(self) -> None:
         if time.monotonic() - self._heard_at > SILENT_S:
