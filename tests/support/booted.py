@@ -159,7 +159,7 @@ async def booted(number: int = 0, *, network: str = "", disk: Path | None = None
             def init() -> int:
                 assert process.returncode is None, _tail(console.fileno())
                 children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-                with contextlib.suppress(FileNotFoundError):  # a step of the boot that has just ended
+                with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a step that has just ended
                     if children and Path(f"/proc/{children[0]}/comm").read_text() == "systemd\n":
                         return int(children[0])
                 return 0
