@@ -47,6 +47,8 @@ TICK = 0.25
 """Seconds between two timer events."""
 REPORT_EVERY = 0.5
 """Seconds after which the progress is published again."""
+QUIET_AFTER, REPORT_QUIET_EVERY = 5.0, 1.0
+"""Seconds without any progress after which it is published more seldom, and how often."""
 _PARAMETERS = GRID_PARAMETERS | {"alive_topic", "answers"}
 OLD_MAP_AFTER = 5.0
 """Seconds without the grid after which a move client looks for it on its old topic."""
@@ -65,6 +67,8 @@ class MoveClientNode:
         self._hears_grid = hears_grid
         self._client: MoveClient | None = None
         self._reported_at = 0.0
+        self._progressed_at = 0.0
+        self._reported: ClientReport | None = None
         self._goals: Publisher
         self._stops: Publisher
         self._reports: Publisher
@@ -127,21 +131,27 @@ class MoveClientNode:
         if self._alive_topic:
             await node.subscribe_serialized(self._alive_topic, "*", lambda _payload, _latched: self._hear())
 
-    async def keep_time(self, delay: float = 0.0) -> None:
-        """Tick until the node is stopped, first after ``delay`` seconds."""
+    async def keep_time(self) -> None:
+        """Tick until the node is stopped; look for the grid's old topic while there is no grid."""
         node = self._node
-        await node.sleep(delay)
         look_at = time.monotonic() + OLD_MAP_AFTER
         while await node.sleep(TICK):
-            if self._client is None:
-                if self._hears_grid and not self._hears_old and time.monotonic() >= look_at:
-                    await self._look_for_old_map()
-                    look_at = time.monotonic() + OLD_MAP_AFTER
-                continue
-            now = self._node.time()
-            self._do(self._client.tick(now))
-            if not 0 <= now - self._reported_at < REPORT_EVERY:  # simulated time may jump back
-                self._do([self._client.report])
+            self.tick()
+            is_blind = self._client is None and self._hears_grid and not self._hears_old
+            if is_blind and time.monotonic() >= look_at:
+                await self._look_for_old_map()
+                look_at = time.monotonic() + OLD_MAP_AFTER
+
+    def tick(self) -> None:
+        """Send again what had no effect, and a report if one is due; call it every ``TICK`` seconds."""
+        if self._client is None:
+            return
+        now = self._node.time()
+        self._do(self._client.tick(now))
+        is_quiet = now - self._progressed_at >= QUIET_AFTER
+        every = REPORT_QUIET_EVERY if is_quiet else REPORT_EVERY
+        if not 0 <= now - self._reported_at < every:  # simulated time may jump back
+            self._do([self._client.report])
 
     # What comes in
 
@@ -291,6 +301,8 @@ class MoveClientNode:
         self, report: ClientReport, blocked: tuple[int, ...] = (), freed: tuple[int, ...] = ()
     ) -> None:
         self._reported_at = self._node.time()
+        if report != self._reported or self._reported_at < self._progressed_at:
+            self._reported, self._progressed_at = report, self._reported_at
         sign = self._signs.sign(time.monotonic(), is_driving=report.state is ClientState.DRIVING)
         if self._answers:
             self._reports.publish(answer_array(Answer(report, blocked, freed, sign)))
