@@ -25,8 +25,10 @@ _log = logging.getLogger(__name__)
 
 POLL_S = 1.0
 RATES_EVERY_S = 5.0
+"""How often the counters of all interfaces are read, at most."""
+LARGE_PAUSE = 20
+"""After a list that grows with the fleet was read, it is not read for so many times as long as that took."""
 PAGE_ITEMS = 1000
-"""How often the counters of all interfaces are read."""
 TIMEOUT = aiohttp.ClientTimeout(total=5)
 
 
@@ -58,7 +60,9 @@ class EngineWatch:
         self._last: dict[str, Any] = {}
         self._session: aiohttp.ClientSession | None = None
         self._rates = InterfaceRates()
-        self._rated_at = float("-inf")
+        self._rates_due = float("-inf")
+        self._connections: list[dict[str, Any]] = []
+        self._connections_due = float("-inf")
 
     async def read_items(self, kind: str) -> list[dict[str, Any]]:
         """Return the user's items of a kind from the REST API, such as ``interfaces``.
@@ -113,6 +117,8 @@ class EngineWatch:
                 self._token = ""
                 self._masters.failed(master)
                 state = {"error": f"another program than a master answers at {master}"}
+            if "error" in state:
+                self._rates_due = self._connections_due = float("-inf")
             if state != self._last:
                 self._last = state
                 self._on_state(state)
@@ -132,14 +138,9 @@ class EngineWatch:
         if not self._token:
             async with session.post(self._api / "login", json=self._login, **self._request_options) as reply:
                 self._token = (await reply.json())["token"]
-        containers, nodes, connections = [
-            (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
-        ]
+        containers, nodes = [(await self._get(session, kind))[kind] for kind in ("containers", "nodes")]
         usage = await self._get(session, "usage")
-        now = asyncio.get_running_loop().time()
-        if now - self._rated_at >= RATES_EVERY_S:
-            self._rated_at = now
-            self._rates.take(now, (await self._get(session, "interfaces"))["interfaces"])
+        await self._read_large(session)
         used = {container["id"]: container for container in usage["containers"]}
         return {
             "containers": [
@@ -159,11 +160,21 @@ class EngineWatch:
                     **{key: connection[key] for key in ("tag_a", "tag_b", "established")},
                     **self._rate(connection["tag_a"], connection["tag_b"]),
                 }
-                for connection in connections
+                for connection in self._connections
             ],
             # Only administrators get machines.
             "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
         }
+
+    async def _read_large(self, session: aiohttp.ClientSession) -> None:
+        """Read the lists that grow with the fleet, if they are due."""
+        now = asyncio.get_running_loop().time
+        if (began := now()) >= self._connections_due:
+            self._connections = (await self._get(session, "connections"))["connections"]
+            self._connections_due = now() + LARGE_PAUSE * (now() - began)
+        if (began := now()) >= self._rates_due:
+            self._rates.take(began, (await self._get(session, "interfaces"))["interfaces"])
+            self._rates_due = max(began + RATES_EVERY_S, now() + LARGE_PAUSE * (now() - began))
 
     def _rate(self, tag_a: str, tag_b: str) -> dict[str, float]:
         """Return messages and bytes in a second of a connection; neither before they are known."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+from collections import Counter
 from typing import Any
 
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
 
+from rce_fleet.station import engine_watch
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
@@ -96,6 +98,33 @@ async def test_what_containers_use_is_read_with_their_state() -> None:
     assert (second["usage"], second["advice"]) == (None, [])
     (machine,) = (await watched())["machines"]
     assert machine == {key: value for key, value in MACHINE.items() if key != "cpu"}
+
+
+async def test_lists_of_a_large_fleet_are_read_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    """16 000 connections were read each second, for as long as that took."""
+    monkeypatch.setattr(engine_watch, "POLL_S", 0.01)
+    asked: Counter[str] = Counter()
+
+    async def answer(request: web.Request) -> web.Response:
+        name = request.path.rpartition("/")[2]
+        asked[name] += 1
+        if name == "connections":
+            await asyncio.sleep(0.05)
+        return web.json_response({"token": "t"} if name == "login" else ANSWERS[name])
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/{name}", answer)
+    async with TestServer(app) as server:
+        watch = asyncio.create_task(
+            EngineWatch(str(server.make_url("/")), "op", "x", on_state=lambda _: None).run()
+        )
+        async with asyncio.timeout(30):
+            while asked["connections"] < 2:
+                await asyncio.sleep(0.01)
+        watch.cancel()
+        await asyncio.gather(watch, return_exceptions=True)
+    assert asked["containers"] > asked["connections"] + 3
+    assert asked["interfaces"] == 1
 
 
 async def test_of_several_masters_one_that_answers_is_watched() -> None:
