@@ -14,6 +14,7 @@ import struct
 from dataclasses import dataclass
 from functools import partial
 from math import cos, pi, sin
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,7 +40,8 @@ UPDATE_MIN_D = 0.25
 UPDATE_MIN_A = pi / 6
 """Radians between two poses, as the default of ``amcl``."""
 STATUS_EVERY = 1.0
-"""Seconds between two status lists of a robot; the fleet takes robots for silent after 3 s."""
+"""Seconds between two status lists of a robot, of simulated time or of the clock, whichever is sooner: the
+fleet takes robots for silent after 3 s of the clock, also where the world runs slower."""
 POSE_EVERY = 5.0
 """Seconds after which a standing robot sends its pose again, for those that came later."""
 BATTERY_EVERY = 10.0
@@ -113,7 +115,9 @@ class LightDriver:
         # Spread over time: not all robots send in the same step.
         spread = np.linspace(0.0, BATTERY_EVERY, count, endpoint=False)
         self._measured_at: Floats = self._robots.time - spread
-        self._listed_at: Floats = self._robots.time - np.linspace(0.0, STATUS_EVERY, count, endpoint=False)
+        spread = np.linspace(0.0, STATUS_EVERY, count, endpoint=False)
+        self._listed_at: Floats = self._robots.time - spread
+        self._listed_by_clock: Floats = monotonic() - spread
 
     def update(self, ended: Sequence[int]) -> None:
         """Publish what is due; call it after a step of the world.
@@ -128,8 +132,9 @@ class LightDriver:
             if row in self._topics:
                 self._publish_results(row, stamp)
         self._publish_poses(now, stamp)
-        due = np.flatnonzero(now - self._listed_at >= STATUS_EVERY - 1e-6)
-        self._listed_at[due] = now
+        clock, least = monotonic(), STATUS_EVERY - 1e-6
+        due = np.flatnonzero((now - self._listed_at >= least) | (clock - self._listed_by_clock >= least))
+        self._listed_at[due], self._listed_by_clock[due] = now, clock
         for row in self._rows[due].tolist():
             self._publish_status(row, stamp)
         due = np.flatnonzero(now - self._measured_at >= BATTERY_EVERY - 1e-6)

@@ -12,7 +12,7 @@ from support.ros_requests import count_requests
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce_fleet.drivers.light_driver import LightDriver
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.light.robots import LightRobots
@@ -49,6 +49,32 @@ async def test_light_robots_obey_stops_and_hands() -> None:
         await until(has_moved)
         stop.publish(data=False)
         await until(lambda: not robots.stopped.any())
+
+
+async def test_robots_of_a_slow_world_stay_heard() -> None:
+    """A world at a quarter of real time sent a status every 4 s; the fleet took robots for silent."""
+    robots = LightRobots({"Robot1": Pose(0, 0, 0), "Robot2": Pose(0, 5, 0)}, np.empty((0, 4)))
+    async with (
+        Core(port=0) as core,
+        Node("world", argv=[], master_uri=core.uri, types=TYPES) as node,
+        Node("client", argv=[], master_uri=core.uri, types=TYPES) as client,
+    ):
+        driver = LightDriver(node, robots, range(2))
+        await driver.start()
+        heard: list[float] = []
+
+        def hear(_: Message) -> None:
+            heard.append(robots.time)
+
+        await client.subscribe("/Robot1/move_base/status", "actionlib_msgs/GoalStatusArray", hear)
+
+        def update() -> bool:
+            robots.advance(0.001)
+            driver.update(())
+            return len(heard) >= 4
+
+        await until(update)
+        assert robots.time < 2
 
 
 async def test_topics_of_many_robots_are_registered_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:
