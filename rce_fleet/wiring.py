@@ -31,6 +31,11 @@ OPERATOR = "fleetOperator"
 VOLUME = {"name": "fleet", "path": "/volumes/fleet", "size": "128M", "snapshots": 30}
 """The volume with the journal of the fleet manager, which finds it by its name. If its machine is lost, the
 fleet continues on another one, without what happened since the last snapshot."""
+ROBOTS_OF_SLOT = 250
+"""With so many robots, planner and manager need no more than the memory of one slot, 512 MB."""
+BASE_MEMORY, ROBOTS_OF_MB = 512, 2
+"""MB for a larger fleet, and robots for each MB more. 1000 robots used 625 MB when all started at once
+after the container had died."""
 FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
     "rows": 8,
     "columns": 8,
@@ -150,6 +155,8 @@ def fleet_config(
     account: FleetAccount | None = None,
     parameters: dict[str, bool | int | float | str | list[Any]] | None = None,
     manager: Mapping[str, bool | int | float | str | list[Any]] | None = None,
+    *,
+    robots: int = 0,
 ) -> dict[str, Any]:
     """Return the operator's config: the container with planner and fleet manager.
 
@@ -158,15 +165,19 @@ def fleet_config(
         parameters: The planner's parameters by name, such as ``rows``; those of the floor of
             ``configs/scene.yaml`` if None.
         manager: The manager's parameters by name, such as ``chargers``.
+        robots: Size of the fleet; more than :data:`ROBOTS_OF_SLOT` robots need a larger container.
     """
     account = account or FleetAccount()
     given = FLOOR_PARAMETERS if parameters is None else parameters
+    container: dict[str, Any] = {"cTag": FLEET_CONTAINER, "volumes": [VOLUME]}
+    if robots > ROBOTS_OF_SLOT:
+        container["memory"] = f"{BASE_MEMORY + robots // ROBOTS_OF_MB}M"
     return {
         "url": account.url,
         "userID": account.user,
         "password": account.password,
         "robotID": OPERATOR,
-        "containers": [{"cTag": FLEET_CONTAINER, "volumes": [VOLUME]}],
+        "containers": [container],
         "parameters": [
             {"cTag": FLEET_CONTAINER, "name": f"/fleet/{name}", "value": value}
             for name, value in given.items()

@@ -122,7 +122,8 @@ class CloudPrograms:
     def _write_files(self) -> None:
         config, account, folder = self._config, self._config.account, self._config.folder
         config.write_scene()
-        fleet = fleet_config(account, config.planner_parameters, config.manager_parameters)
+        robots = len(config.scenario.robots)
+        fleet = fleet_config(account, config.planner_parameters, config.manager_parameters, robots=robots)
         (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
         files = {f"robot{number}": client_config(config, number) for number in range(1, config.full + 1)}
         files |= {_light_name(*ends): light_config(*ends, account) for ends in config.light_groups}

@@ -26,6 +26,13 @@ def test_the_shipped_operator_file_is_what_is_made() -> None:
     assert (CONFIGS / "fleet.config").read_text() == write_items(fleet_config())
 
 
+@pytest.mark.parametrize(("robots", "memory"), [(3, 0), (250, 0), (400, 712), (1000, 1012)])
+def test_a_large_fleet_asks_for_memory(robots: int, memory: int) -> None:
+    """Planner and manager of a thousand robots were ended for memory at the limit of one slot."""
+    (container,) = loads(write_items(fleet_config(robots=robots))).containers
+    assert container.resources.memory == memory << 20
+
+
 @pytest.mark.parametrize("name", ["test", "robot1-long", "robot1", "robot2", "robot3", "fleet"])
 def test_shipped_files_are_valid(name: str) -> None:
     load(CONFIGS / f"{name}.config")
