@@ -31,6 +31,9 @@ MAX_ACTIVE = 64
 MAX_IDLE = MAX_ACTIVE
 """How many idle connections a client keeps: one for each call of a burst, so that the next opens none."""
 
+PROBE_S = 10.0
+"""Seconds in which a provider has to answer one who only asks whether it is there."""
+
 
 class ServiceClient:
     """Calls one service. Made by :meth:`rce.ros.node.Node.service_client`.
@@ -197,18 +200,19 @@ class ServiceClient:
 
 
 async def answers(runtime: Runtime, name: str) -> bool:
-    """Return whether a service has a provider that can be reached."""
+    """Return whether a service has a provider that can be reached and answers."""
     uri = await runtime.master.lookup_service(name)
     if uri is None:
         return False
     probe = {"callerid": runtime.name, "service": name, "md5sum": ANY, "probe": "1"}
     try:
-        call = await _Call.open(name, uri, runtime.scratch)
-        try:
-            return "error" not in decode_header(await call.exchange((encode_header(probe),)))
-        finally:
-            await call.close()
-    except (ServiceLostError, MalformedFrameError):
+        async with asyncio.timeout(PROBE_S):
+            call = await _Call.open(name, uri, runtime.scratch)
+            try:
+                return "error" not in decode_header(await call.exchange((encode_header(probe),)))
+            finally:
+                await call.close()
+    except (ServiceLostError, MalformedFrameError, TimeoutError):
         return False
 
 

@@ -16,7 +16,7 @@ from rce.ros.errors import MasterUnreachableError, ServiceLostError
 from rce.ros.multimaster.contacts import ask_contact
 from rce.ros.multimaster.errors import MalformedStateError
 from rce.ros.multimaster.peer_table import PeerKey
-from rce.ros.node import Node
+from rce.ros.node import Node, service_client
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 from rce.ros.xmlrpc.codec import decode_call
@@ -93,11 +93,13 @@ async def test_publisher_with_a_bad_answer_ends_no_subscriber() -> None:
 
 
 @asynccontextmanager
-async def provider(core: Core, answer: bytes) -> AsyncIterator[None]:
-    """Provide ``/s``: each client gets ``answer``."""
+async def provider(core: Core, answer: bytes) -> AsyncIterator[asyncio.Event]:
+    """Provide ``/s``: each client gets ``answer``; yield an event of the first one."""
+    asked = asyncio.Event()
 
     async def greet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(1)
+        asked.set()
         writer.write(answer)
         await reader.read()
         writer.close()
@@ -108,7 +110,7 @@ async def provider(core: Core, answer: bytes) -> AsyncIterator[None]:
         await rpc.call(
             core.uri, "registerService", ("/bad", "/s", f"rosrpc://127.0.0.1:{port}", "http://127.0.0.1:1/")
         )
-        yield
+        yield asked
 
 
 async def test_provider_with_a_bad_header_is_a_lost_one(core: Core, make_node: MakeNode) -> None:
@@ -117,6 +119,23 @@ async def test_provider_with_a_bad_header_is_a_lost_one(core: Core, make_node: M
             await node.service_client("/s", "std_srvs/Empty").call({})
         with pytest.raises(TimeoutError):
             await node.wait_for_service("/s", timeout=0.3)
+
+
+async def test_another_provider_is_found_behind_a_mute_one(
+    core: Core, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped provider held those who waited, however soon another one took its place."""
+    monkeypatch.setattr(service_client, "PROBE_S", 0.3)
+    async with (
+        provider(core, b"") as asked,
+        make_node("a") as a,
+        make_node("b") as b,
+        asyncio.timeout(60),
+    ):
+        waiting = asyncio.create_task(b.wait_for_service("/s"))
+        await asked.wait()
+        await a.advertise_service("/s", "std_srvs/Empty", lambda _: {})
+        await waiting
 
 
 @pytest.mark.parametrize("uri", ["rosrpc://[bad:5", "rosrpc://a:70000", "rosrpc://", "5"])
