@@ -32,7 +32,7 @@ VOLUME = {"name": "fleet", "path": "/volumes/fleet", "size": "128M", "snapshots"
 """The volume with the journal of the fleet manager, which finds it by its name. If its machine is lost, the
 fleet continues on another one, without what happened since the last snapshot."""
 ROBOTS_OF_SLOT = 250
-"""With so many robots, planner and manager need no more than the memory of one slot, 512 MB."""
+"""So many robots need no more than the memory of one slot, 512 MB: 366 MB were used when 300 had joined."""
 BASE_MEMORY, ROBOTS_OF_MB = 512, 2
 """MB for a larger fleet, and robots for each MB more. 1000 robots used 625 MB when all started at once
 after the container had died."""

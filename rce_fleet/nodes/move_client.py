@@ -132,7 +132,7 @@ class MoveClientNode:
             await node.subscribe_serialized(self._alive_topic, "*", lambda _payload, _latched: self._hear())
 
     async def keep_time(self) -> None:
-        """Tick until the node is stopped; look for the grid's old topic while there is no grid."""
+        """Tick until the node is stopped; look for the grid's old topic while the grid is missing."""
         node = self._node
         look_at = time.monotonic() + OLD_MAP_AFTER
         while await node.sleep(TICK):

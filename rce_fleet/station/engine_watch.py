@@ -27,7 +27,7 @@ POLL_S = 1.0
 RATES_EVERY_S = 5.0
 """How often the counters of all interfaces are read, at most."""
 LARGE_PAUSE = 20
-"""After a list that grows with the fleet was read, it is not read for so many times as long as that took."""
+"""A list that grows with the fleet is read again after so many times the time that reading it took."""
 PAGE_ITEMS = 1000
 TIMEOUT = aiohttp.ClientTimeout(total=5)
 
