@@ -24,8 +24,10 @@ from rce_fleet.localization.parameters import LaserModel
 from rce_fleet.localization.scan import LaserScan
 from rce_fleet.nodes.amcl_frames import RobotFrames
 from rce_fleet.nodes.amcl_parameters import UNUSED, AmclNodeParameters
+from rce_fleet.nodes.amcl_pose_store import PoseStore
 from rce_fleet.nodes.amcl_state import describe
 from rce_fleet.nodes.diagnostics import Diagnostics
+from rce_fleet.nodes.kept_pose import KeptPose
 from rce_fleet.nodes.map_messages import read_scan
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_fields, read_map
@@ -41,6 +43,8 @@ SCANS = 5
 """Scans that wait for their transforms; more are dropped, the oldest first."""
 MAP_RETRY = 0.5
 """Seconds between two tries to get the map from its service."""
+FIRST_SAVE = 0.1
+"""Seconds between two looks for a first pose to store: the robot may drive away and the node die at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,7 @@ class _Found:
 
     estimate: Estimate
     stamp: Time
+    kept: KeptPose
 
 
 class AmclNode:
@@ -68,11 +73,11 @@ class AmclNode:
         self._start: tuple[Pose, NDArray[np.float64]] | None = None
         self._found: _Found | None = None
         self._watch = OdometryWatch()
+        self._store = PoseStore(node, parameters)
         self._throttled_log = ThrottledLog(node)
         self._fault = ""
         self._used_at: float | None = None
         self._scan_stamp = Time()
-        self._saved: Pose | None = None
         self._cloud_due = True
         """Whether the particles were not published since they changed: there was no subscriber."""
         self._frames: RobotFrames
@@ -206,6 +211,7 @@ class AmclNode:
             return False
         pose = pose.compose(self._frames.moved_since(message.header.stamp))
         self._start = pose, covariance
+        self._store.forget()
         if self._amcl is not None:
             self._amcl.set_pose(*self._start, self._frames.odometry_now())
         self._cloud_due = True
@@ -216,6 +222,7 @@ class AmclNode:
         if self._amcl is None:
             self._node.log.warning("global_localization: there is no map yet")
         else:
+            self._store.forget()
             self._amcl.scatter()
             self._node.log.info("global localization: particles on all free cells")
             self._publish_cloud(self._node.now())
@@ -264,10 +271,16 @@ class AmclNode:
         if jump:
             self._throttled_log.warn("odometry", f"{jump}; the pose before it is kept")
             self._amcl.forget_odometry()
+        stored = self._store.take(odometry, stamp.to_sec())
+        if stored is not None:
+            at = stored.pose
+            self._amcl.set_pose(at, stored.covariance, odometry)
+            self._node.log.info("the robot is at (%.3f, %.3f, %.3f) by its stored pose", at.x, at.y, at.yaw)
         estimate = self._amcl.update(odometry, scan)
         self._fault, self._used_at = "", self._node.time()
         if estimate is not None:
-            self._found = _Found(estimate, stamp)
+            kept = KeptPose(self._frames.map_frame, estimate.pose, estimate.covariance, odometry)
+            self._found = _Found(estimate, stamp, kept)
             self._publish(self._found)
         if self._found is not None and self._parameters.tf_broadcast:
             self._frames.send(self._found.estimate.map_from_odom, stamp)
@@ -307,22 +320,11 @@ class AmclNode:
     async def _save_poses(self) -> None:
         """Store the pose where a restarted node finds it."""
         rate = self._parameters.save_pose_rate
-        while rate > 0 and await self._node.sleep(1 / rate):
-            if self._found is None or self._found.estimate.pose == self._saved:
+        while rate > 0 and await self._node.sleep(FIRST_SAVE if self._found is None else 1 / rate):
+            if self._found is None:
                 continue
-            pose, covariance = self._found.estimate.pose, self._found.estimate.covariance
-            self._saved = pose
-            values = {
-                "initial_pose_x": pose.x,
-                "initial_pose_y": pose.y,
-                "initial_pose_a": pose.yaw,
-                "initial_cov_xx": float(covariance[0, 0]),
-                "initial_cov_yy": float(covariance[1, 1]),
-                "initial_cov_aa": float(covariance[2, 2]),
-            }
             try:
-                for name, value in values.items():
-                    await self._node.set_param(f"~{name}", value)
+                await self._store.save(self._found.kept, self._found.stamp.to_sec())
             except RosError as error:
                 self._throttled_log.warn("save", f"the pose cannot be stored in the parameters: {error}")
 

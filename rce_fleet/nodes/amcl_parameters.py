@@ -30,8 +30,11 @@ class AmclNodeParameters(AmclParameters):
         first_map_only: Ignore all maps on the topic but the first.
         last_pose_timeout: How long the node waits at its start for the service ``last_pose`` of the node
             ``pose_keeper``, which knows where the robot was localized before, seconds; 0: not at all.
-        save_pose_rate: How often the pose is stored in the parameters ``initial_pose_*``, 1/s; not positive:
-            never.
+        save_pose_rate: How often the pose is stored in the parameters ``initial_pose_*``, ``initial_cov_*``
+            and ``stored_pose``, 1/s; not positive: never.
+        stored_pose: Set by the node: the pose of ``initial_pose_*`` with the odometry of its time, as JSON.
+            While they have the same pose, the node that is started again begins where the robot has driven
+            since.
         std_warn_level_x: Standard deviation from which ``/diagnostics`` warns, metres.
         std_warn_level_y: The same along y.
         std_warn_level_yaw: The same of the heading, radians.
@@ -48,6 +51,7 @@ class AmclNodeParameters(AmclParameters):
     first_map_only: bool = False
     last_pose_timeout: float = field(default=0.0, metadata={"minimum": 0.0})
     save_pose_rate: float = 0.5
+    stored_pose: str = ""
     std_warn_level_x: float = field(default=0.2, metadata={"above": 0.0})
     std_warn_level_y: float = field(default=0.2, metadata={"above": 0.0})
     std_warn_level_yaw: float = field(default=0.1, metadata={"above": 0.0})

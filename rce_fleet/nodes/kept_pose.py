@@ -12,6 +12,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.jumps import OdometryWatch
 from rce_fleet.geometry.poses import Pose
 
 if TYPE_CHECKING:
@@ -45,12 +47,14 @@ class KeptPose:
 
         Args:
             odometry: The later pose by odometry.
-            share: Standard deviation that is added, as a share of the distance.
+            share: Standard deviation that is added, as a share of the distance; the heading's also grows by
+                this share of the turn.
             least: Standard deviation that is added in any case, metres and radians.
         """
         moved = odometry.relative_to(self.odometry)
         added = least + share * hypot(moved.x, moved.y)
-        return self.pose.compose(moved), self.covariance + np.diag((added**2,) * 3)
+        turned = added + share * abs(wrap(moved.yaw))
+        return self.pose.compose(moved), self.covariance + np.diag((added**2, added**2, turned**2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,27 +64,67 @@ class StoredPose:
     Attributes:
         kept: The pose.
         boot: Which start of the machine it is of.
+        time: When the robot was there, seconds of ROS time.
     """
 
     kept: KeptPose
     boot: str
+    time: float
 
-    def resume(self, odometry: Pose, boot: str) -> KeptPose:
+    def resume(self, odometry: Pose, boot: str, time: float) -> KeptPose:
         """Return the pose with the odometry that the robot has now.
 
         Within one start of the machine the odometry has gone on, and tells how the robot moved since. Else,
-        and if it is at its origin again, it has begun anew: the robot is taken to stand where it was.
+        if it is at its origin again, or farther away than the robot can have driven, it has begun anew: the
+        robot is taken to stand where it was.
 
         Args:
             odometry: Pose by odometry now.
             boot: Which start of the machine this is.
+            time: Seconds of ROS time now.
         """
         kept = self.kept
         was_away = hypot(kept.odometry.x, kept.odometry.y) >= ORIGIN_M
         has_begun_anew = was_away and hypot(odometry.x, odometry.y) < ORIGIN_M
-        if boot == self.boot and not has_begun_anew:
+        watch = OdometryWatch()
+        watch.check(kept.odometry, self.time)
+        if boot == self.boot and not has_begun_anew and not watch.check(odometry, time):
             return kept
         return KeptPose(kept.frame, kept.pose, kept.covariance, odometry)
+
+    def to_json(self) -> str:
+        """Return the text from which :meth:`from_json` makes it again."""
+        kept = self.kept
+        fields = {
+            "boot": self.boot,
+            "time": self.time,
+            "frame": kept.frame,
+            "pose": kept.pose.as_array().tolist(),
+            "covariance": kept.covariance.tolist(),
+            "odometry": kept.odometry.as_array().tolist(),
+        }
+        return json.dumps(fields)
+
+    @classmethod
+    def from_json(cls, text: str) -> StoredPose:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            ValueError: It is not such a text; the error says what is wrong.
+        """
+        fields = json.loads(text)
+        try:
+            pose, odometry = (np.array(fields[name], np.float64) for name in ("pose", "odometry"))
+            covariance = np.array(fields["covariance"], np.float64)
+            frame, boot, time = str(fields["frame"]), str(fields["boot"]), float(fields["time"])
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"it has no usable {error}") from error
+        if pose.shape != (3,) or odometry.shape != (3,) or covariance.shape != (3, 3):
+            raise ValueError("expected a pose and an odometry of 3 numbers and a covariance of 3 x 3")
+        if not all(np.isfinite(each).all() for each in (pose, odometry, covariance, time)):
+            raise ValueError("it has numbers that are not finite")
+        kept = KeptPose(frame, Pose.from_array(pose), covariance, Pose.from_array(odometry))
+        return cls(kept, boot, time)
 
     def write(self, path: Path) -> None:
         """Write the file; the one before is replaced when it is complete.
@@ -88,17 +132,9 @@ class StoredPose:
         Raises:
             OSError: It cannot be written.
         """
-        kept = self.kept
-        fields = {
-            "boot": self.boot,
-            "frame": kept.frame,
-            "pose": kept.pose.as_array().tolist(),
-            "covariance": kept.covariance.tolist(),
-            "odometry": kept.odometry.as_array().tolist(),
-        }
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_suffix(".new")
-        aside.write_text(json.dumps(fields) + "\n", encoding="utf-8")
+        aside.write_text(self.to_json() + "\n", encoding="utf-8")
         aside.replace(path)
 
 
@@ -110,20 +146,10 @@ def read_stored_pose(path: Path) -> StoredPose | None:
         ValueError: It is not such a file; the text says what is wrong.
     """
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         return None
-    try:
-        pose, odometry = (np.array(fields[name], np.float64) for name in ("pose", "odometry"))
-        covariance = np.array(fields["covariance"], np.float64)
-        frame, boot = str(fields["frame"]), str(fields["boot"])
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"it has no usable {error}") from error
-    if pose.shape != (3,) or odometry.shape != (3,) or covariance.shape != (3, 3):
-        raise ValueError("expected a pose and an odometry of 3 numbers and a covariance of 3 x 3")
-    if not all(np.isfinite(each).all() for each in (pose, odometry, covariance)):
-        raise ValueError("it has numbers that are not finite")
-    return StoredPose(KeptPose(frame, Pose.from_array(pose), covariance, Pose.from_array(odometry)), boot)
+    return StoredPose.from_json(text)
 
 
 def boot_id() -> str:

@@ -134,7 +134,7 @@ class PoseKeeper:
         if self._written is not None and _is_same(now, self._written):
             return
         try:
-            StoredPose(now, self._boot).write(self._path)
+            StoredPose(now, self._boot, self._node.time()).write(self._path)
         except OSError as error:
             self._throttled_log.warn("file", f"the pose cannot be stored: {self._path}: {error}")
         else:
@@ -173,7 +173,7 @@ class PoseKeeper:
             self._kept = KeptPose(self._kept.frame, pose, covariance, odometry)
         self._odometry = odometry
         if self._stored is not None and self._kept is None:
-            kept = self._stored.resume(odometry, self._boot)
+            kept = self._stored.resume(odometry, self._boot, self._node.time())
             wider = kept.covariance + np.diag((self._parameters.restart_error**2,) * 3)
             self._kept = KeptPose(kept.frame, kept.pose, wider, kept.odometry)
             self._stored = None

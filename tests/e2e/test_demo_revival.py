@@ -43,21 +43,6 @@ async def knows_robots(station: StationClient, count: int) -> bool:
     return False
 
 
-async def stands(station: StationClient, robot: str) -> None:
-    """Wait until a robot has not moved for so long that localization has stored where it is.
-
-    It turns when it is placed, and localization stores its pose every two seconds.
-    """
-    before = object()
-    async with asyncio.timeout(90):
-        while True:
-            (pose,) = [one.pose for one in (await station.fleet()).robots if one.id == robot]
-            if pose is not None and pose == before:
-                return
-            before = pose
-            await asyncio.sleep(5)
-
-
 async def test_killed_parts_return_killed_world_is_named() -> None:
     async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
@@ -72,7 +57,6 @@ async def test_killed_parts_return_killed_world_is_named() -> None:
         def distance(cell: int) -> int:
             return abs(cell // columns - here // columns) + abs(cell % columns - here % columns)
 
-        await stands(station, robot.id)
         near = min(set(range(fleet.map.rows * columns)) - taken, key=lambda cell: (distance(cell), cell))
         kill_program(demo.process.pid, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
         kill_program(demo.process.pid, "rce_fleet.station")

@@ -23,10 +23,12 @@ from rce_fleet.localization.parameters import LaserModel
 from rce_fleet.nodes.amcl import AmclNode
 from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
 from rce_fleet.nodes.map_messages import map_fields
+from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_fields, pose_of
 from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
 
 PATIENCE = 60.0
+ORIGIN = Pose(0.0, 0.0, 0.0)
 START = Pose(1.0, 1.0, 0.3)
 SETTINGS = AmclNodeParameters(
     max_particles=1000,
@@ -72,6 +74,30 @@ class World:
         )
         self.tf = await stack.enter_async_context(TransformListener(judge))
 
+    @asynccontextmanager
+    async def amcl(self, settings: AmclNodeParameters | None = None) -> AsyncIterator[None]:
+        """Run the node; without settings with the parameters that the master has."""
+        async with Node("amcl", argv=[], master_uri=self.core.uri) as node:
+            given = await read_parameters(node, AmclNodeParameters) if settings is None else settings
+            running = asyncio.create_task(AmclNode(node, given, seed=1).run())
+            try:
+                yield
+                assert not running.done()
+            finally:
+                node.shutdown("the test is over")
+                await running
+
+    async def ready(self) -> None:
+        """Wait until the node has the map and hears scans."""
+        await self.says("map of 100 x 80 cells")
+        await self.until(lambda: self.robot._scans.connections)
+
+    async def first_pose(self) -> Message:
+        """Return what a node that was started again finds with one scan."""
+        await self.until(lambda: sum("map of 100" in text for _, text in self.logs) == 2)
+        await self.until(lambda: self.robot._scans.connections)
+        return await self.pose_at(self.robot.publish())
+
     async def until(self, condition: Callable[[], object]) -> None:
         async with asyncio.timeout(PATIENCE):
             while not condition():
@@ -101,7 +127,8 @@ class World:
 
 
 @asynccontextmanager
-async def world(settings: AmclNodeParameters = SETTINGS, *, with_map: bool = True) -> AsyncIterator[World]:
+async def graph(*, with_map: bool = True) -> AsyncIterator[World]:
+    """Run everything but the node itself."""
     async with AsyncExitStack() as stack:
         core = await stack.enter_async_context(Core(port=0))
 
@@ -116,17 +143,15 @@ async def world(settings: AmclNodeParameters = SETTINGS, *, with_map: bool = Tru
             fields = map_fields(hall(), "map", Time(1, 0))
             await source.advertise_service("static_map", "nav_msgs/GetMap", lambda _: {"map": fields})
         await robot.start(stack)
-        amcl = await node("amcl")
-        running = asyncio.create_task(AmclNode(amcl, settings, seed=1).run())
-        try:
-            if with_map:
-                await made.says("map of 100 x 80 cells")
-                await made.until(lambda: robot._scans.connections)
-            yield made
-            assert not running.done()
-        finally:
-            amcl.shutdown("the test is over")
-            await running
+        yield made
+
+
+@asynccontextmanager
+async def world(settings: AmclNodeParameters = SETTINGS, *, with_map: bool = True) -> AsyncIterator[World]:
+    async with graph(with_map=with_map) as made, made.amcl(settings):
+        if with_map:
+            await made.ready()
+        yield made
 
 
 async def test_a_driving_robot_is_localized() -> None:
@@ -277,26 +302,68 @@ async def test_without_a_map_the_state_says_so() -> None:
 
 async def test_last_pose_of_the_robot_counts_before_parameters() -> None:
     far = replace(SETTINGS, initial_pose_x=4.0, initial_pose_y=3.0, last_pose_timeout=1e6)
-    async with AsyncExitStack() as stack:
-        core = await stack.enter_async_context(Core(port=0))
-        keeper, judge = [
-            await stack.enter_async_context(Node(name, argv=[], master_uri=core.uri))
-            for name in ("keeper", "judge")
-        ]
+    async with graph() as here:
         pose = pose_with_covariance_fields(START, np.diag((0.02, 0.02, 0.02)))
         answer = {"known": True, "pose": {"header": {"frame_id": "map"}, "pose": pose}}
-        await keeper.advertise_service("last_pose", "fleet/GetLastPose", lambda _: answer)
-        robot = Robot(keeper, START)
-        here = World(core, judge, robot)
-        await here.listen(stack)
-        fields = map_fields(hall(), "map", Time(1, 0))
-        await keeper.advertise_service("static_map", "nav_msgs/GetMap", lambda _: {"map": fields})
-        await robot.start(stack)
-        amcl = await stack.enter_async_context(Node("amcl", argv=[], master_uri=core.uri))
-        running = asyncio.create_task(AmclNode(amcl, far, seed=1).run())
-        await here.says("initial pose (1.000, 1.000, 0.300)")
-        await here.says("map of 100 x 80 cells")
-        await here.until(lambda: robot._scans.connections)
-        assert here.error(await here.drive(2))[0] < 0.2
-        amcl.shutdown("the test is over")
-        await running
+        await here.judge.advertise_service("last_pose", "fleet/GetLastPose", lambda _: answer)
+        async with here.amcl(far):
+            await here.says("initial pose (1.000, 1.000, 0.300)")
+            await here.ready()
+            assert here.error(await here.drive(2))[0] < 0.2
+
+
+@asynccontextmanager
+async def localized_before(*, odometry: Pose = ORIGIN) -> AsyncIterator[World]:
+    """A robot whose localization stored a pose and died. A scan tells the next one next to nothing."""
+    async with graph() as here:
+        here.robot.odometry = odometry
+        async with here.amcl(SETTINGS):
+            await here.ready()
+            pose = (await here.drive(6)).pose.pose.position
+            async with asyncio.timeout(PATIENCE):
+                while await here.judge.get_param("/amcl/initial_cov_aa", None) is None:
+                    await here.judge.sleep(0.1)
+                while await here.judge.get_param("/amcl/initial_pose_x", None) != pose.x:
+                    await here.judge.sleep(0.1)
+        await here.judge.set_param("/amcl/laser_likelihood_max_dist", 0.001)
+        await here.judge.set_param("/amcl/laser_z_rand", 1e6)
+        yield here
+
+
+async def test_restarted_node_knows_how_the_robot_moved_meanwhile() -> None:
+    """A robot that turns when its localization dies goes on turning."""
+    async with localized_before() as here:
+        here.robot.drive(0.5, 0.0)
+        here.robot.drive(0.0, -1.6)
+        async with here.amcl():
+            away, turned = here.error(await here.first_pose())
+        assert away < 0.15
+        assert turned < 0.15
+
+
+async def test_odometry_that_began_anew_does_not_move_the_stored_pose() -> None:
+    async with localized_before(odometry=Pose(400.0, -300.0, 1.0)) as here:
+        here.robot.odometry = ORIGIN
+        async with here.amcl():
+            away, turned = here.error(await here.first_pose())
+        assert away < 0.15
+        assert turned < 0.15
+
+
+async def test_initial_pose_that_was_set_since_counts_before_the_stored_one() -> None:
+    async with localized_before() as here:
+        for axis, value in {"x": 3.0, "y": 2.5, "a": -2.0}.items():
+            await here.judge.set_param(f"/amcl/initial_pose_{axis}", value)
+        here.robot.pose = Pose(3.0, 2.5, -2.0)
+        async with here.amcl():
+            away, turned = here.error(await here.first_pose())
+        assert away < 0.15
+        assert turned < 0.15
+
+
+async def test_damaged_stored_pose_is_told() -> None:
+    async with localized_before() as here:
+        await here.judge.set_param("/amcl/stored_pose", '{"pose": [1, 2, 3]}')
+        async with here.amcl():
+            await here.says("/amcl/stored_pose is not used: it has no usable 'odometry'")
+            assert here.error(await here.first_pose())[0] < 0.15

@@ -140,10 +140,11 @@ async def test_damaged_file_of_the_pose_is_told(tmp_path: Path) -> None:
 
 def test_stored_pose_of_another_boot_stands() -> None:
     kept = KeptPose("map", Pose(1.0, 2.0, 0.0), EXACT, Pose(4.0, 0.0, 0.0))
-    stored = StoredPose(kept, "one")
-    assert stored.resume(Pose(5.0, 0.0, 0.0), "one").odometry == Pose(4.0, 0.0, 0.0)
-    assert stored.resume(Pose(5.0, 0.0, 0.0), "two").odometry == Pose(5.0, 0.0, 0.0)
-    assert stored.resume(Pose(0.0, 0.0, 0.0), "one").odometry == Pose(0.0, 0.0, 0.0)
+    stored = StoredPose(kept, "one", 100.0)
+    assert stored.resume(Pose(5.0, 0.0, 0.0), "one", 102.0).odometry == Pose(4.0, 0.0, 0.0)
+    assert stored.resume(Pose(5.0, 0.0, 0.0), "two", 102.0).odometry == Pose(5.0, 0.0, 0.0)
+    assert stored.resume(Pose(0.0, 0.0, 0.0), "one", 102.0).odometry == Pose(0.0, 0.0, 0.0)
+    assert stored.resume(Pose(50.0, 0.0, 0.0), "one", 102.0).odometry == Pose(50.0, 0.0, 0.0)
     assert BOOT_ID.read_text()
 
 
@@ -152,7 +153,10 @@ def test_stored_pose_of_another_boot_stands() -> None:
     [
         ("{", "Expecting"),
         ("{}", "no usable 'pose'"),
-        ('{"pose": [1], "odometry": [1, 2, 3], "covariance": [], "frame": "map", "boot": ""}', "3 numbers"),
+        (
+            '{"pose": [1], "odometry": [1, 2, 3], "covariance": [], "frame": "map", "boot": "", "time": 1}',
+            "3 numbers",
+        ),
         ("[]", "no usable"),
     ],
 )
