@@ -5,7 +5,14 @@ from __future__ import annotations
 from itertools import repeat
 from typing import Protocol
 
-from rce.control import ClientReply, ControlError, LoginReply, RequestFault, ToMaster
+from rce.control import (
+    ClientReply,
+    ControlError,
+    LoginReply,
+    MasterUnavailableError,
+    RequestFault,
+    ToMaster,
+)
 from rce.model import EndpointId, FaultCode, Request
 from rce.protocol import ErrorReport, type_of, write_request
 
@@ -62,6 +69,10 @@ async def ask_master(
             reply = await channel.client_request(str(id_), type_, content=request)
         else:
             reply = await channel.client_request(str(id_), type_, data=write_request(request))
+    except MasterUnavailableError as error:
+        # It was sent, and only its answer is missing: a client that repeats it gets it done for certain.
+        problem = f"{type_}: it is not known whether it was done: {error}"
+        return (ErrorReport(problem=problem, code=FaultCode.BUSY),)
     except ControlError as error:
         return (ErrorReport(problem=f"{type_}: not done: {error}"),)
     return reports_of(reply)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from rce.control.messages import ClientReply, RequestFault
-from rce.model import FaultCode
+import pytest
+
+from rce.control.exceptions import ControlError, MasterUnavailableError, UnsendableError
+from rce.control.messages import ClientReply, LoginReply, RequestFault, ToMaster
+from rce.model import EndpointId, FaultCode, Request
+from rce.model.requests import DestroyContainer
 from rce.protocol.messages import ErrorReport
-from rce_robot.master_requests import reports_of
+from rce_robot.master_requests import ask_master, reports_of
 
 
 def test_a_refusal_has_its_code_and_the_keys_of_the_request() -> None:
@@ -26,3 +30,43 @@ def test_codes_and_keys_of_a_later_release_are_left_out() -> None:
     fault = RequestFault(code="melted", ids={"rack": "7", "a": "x/y"})
     (report,) = reports_of(ClientReply(request=1, errors=("CX: no",), faults=(fault,)))
     assert report == ErrorReport(problem="CX: no", ids={"tagA": "x/y"})
+
+
+class FailingChannel:
+    """A channel on which each request fails with an error."""
+
+    def __init__(self, error: ControlError) -> None:
+        self.error = error
+
+    def send(self, message: ToMaster) -> None:
+        raise AssertionError(message)
+
+    async def login(
+        self, user: str, robot: str, password: str, address: str = "", token: str = ""
+    ) -> LoginReply:
+        raise self.error
+
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: object = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
+        raise self.error
+
+
+@pytest.mark.parametrize("typed", [True, False])
+async def test_a_request_without_an_answer_may_have_been_done(typed: bool) -> None:
+    channel = FailingChannel(MasterUnavailableError(10.0))
+    (report,) = await ask_master(channel, EndpointId("u", "r"), DestroyContainer(tag="c"), typed=typed)
+    assert report.problem.startswith("DC: it is not known whether it was done: the master did not answer")
+    assert report.code is FaultCode.BUSY, "the client repeats it"
+
+
+async def test_a_request_that_cannot_be_sent_was_not_done() -> None:
+    channel = FailingChannel(UnsendableError("too long"))
+    (report,) = await ask_master(channel, EndpointId("u", "r"), DestroyContainer(tag="c"), typed=True)
+    assert report.problem == "DC: not done: the message cannot be sent: too long"
+    assert report.code is None
