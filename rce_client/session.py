@@ -63,8 +63,8 @@ CONNECTING = "looking for the engine"
 MAX_RECEIVED = 256
 """Most removals that are kept until it is sure that the engine did not drop them."""
 
-REPORTED_WITHIN_S = 10.0
-"""In this time after the engine received a request, it reports that it dropped it."""
+REPORTED_WITHIN_S = 30.0
+"""In this time after the engine received a request, it mostly has reported that it was not carried out."""
 
 
 def _take_note(sent: asyncio.Future[None]) -> None:
@@ -390,7 +390,7 @@ class Session:
 
     def _tell_dropped(self, dropped: int) -> None:
         requests = "1 request was" if dropped == 1 else f"{dropped} requests were"
-        self._take_error(f"{requests} dropped, because too many requests wait; they are sent again")
+        self._take_error(f"{requests} not carried out, because the engine is busy; all are sent again")
 
     def _take_error(self, text: str) -> None:
         self.errors.append(text)

@@ -29,6 +29,7 @@ from rce.control import (
     VolumeRestored,
     VolumeSaved,
 )
+from rce.model import FaultCode
 from rce_master import requests
 from rce_master.audit import AuditLog, describe
 from rce_master.exceptions import (
@@ -36,6 +37,8 @@ from rce_master.exceptions import (
     ForbiddenError,
     MasterError,
     RefusedError,
+    SaveTooLargeError,
+    StoreError,
     TooManyFailuresError,
     TooManyLoginsError,
     TooMuchError,
@@ -275,7 +278,10 @@ class ControlHandler:
         try:
             self._quotas.robot_request(self._state_service.tables.users[user], requests.count_items(request))
         except TooMuchError as error:
-            peer.send(ClientReply(request=request.request, errors=(f"{request.type}: {error}",)))
+            fault = RequestFault(code=error.code.value)
+            peer.send(
+                ClientReply(request=request.request, errors=(f"{request.type}: {error}",), faults=(fault,))
+            )
             return
         wanted, faults = requests.read(user, request)
         parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
@@ -303,7 +309,13 @@ class ControlHandler:
 
 
 def _fault_of(command: commands.Request, error: MasterError) -> RequestFault:
-    code = error.code.value if isinstance(error, RefusedError) else ""
+    match error:
+        case RefusedError():
+            code = error.code.value
+        case StoreError() if not isinstance(error, SaveTooLargeError):
+            code = FaultCode.BUSY.value  # this master ends, or its disk is full: a later attempt may succeed
+        case _:
+            code = ""
     return RequestFault(code=code, ids=requests.ids_of(command))
 
 

@@ -35,7 +35,7 @@ class FaultCode(Enum):
     NO_ROOM = "no_room"
     """No machine has enough of a resource."""
     BUSY = "busy"
-    """Too much is being done now; a later attempt may succeed."""
+    """It cannot be done now, as while too much else is being done; a later attempt may succeed."""
 
 
 class FieldFault(Struct, frozen=True):

@@ -375,6 +375,18 @@ async def running_robots(
     cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Unpack[RobotOptions]
 ) -> AsyncIterator[None]:
     """Run a robot task set for the cloud's master."""
+    async with robot_task_set(control_port, SECRET, session, **settings) as cloud.ws_url:
+        yield
+
+
+@asynccontextmanager
+async def robot_task_set(
+    control_port: int,
+    secret: Secret,
+    session: SessionSettings | None = None,
+    **settings: Unpack[RobotOptions],
+) -> AsyncIterator[str]:
+    """Run a robot task set for a master; yield the URL for robots."""
     ready: asyncio.Queue[str] = asyncio.Queue()
     given = RobotSettings(
         host="127.0.0.1",
@@ -386,10 +398,9 @@ async def running_robots(
     app = App(
         master="127.0.0.1",
         control_port=control_port,
-        secret=SECRET,
+        secret=secret,
         packages=(EXAMPLES,),
         settings=replace(given, **settings),
     )
     async with app.started(ready.put_nowait):
-        cloud.ws_url = await ready.get()
-        yield
+        yield await ready.get()

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import aiohttp
+from integration.master.conftest import SECRET
+from support.cloud import robot_task_set
 from support.fuzzing import Tracebacks
 
-from rce.control.messages import LogChunk, ReadLog, ToTaskSet
+from rce.control.messages import ClientReply, LogChunk, ReadLog, ToTaskSet
+from rce_client.connection import Connection
 from rce_master.auth import client_digest
 from rce_master.http import api_stream
 from rce_master.quotas import QuotaSettings
@@ -60,15 +63,34 @@ async def test_requests_of_robots(run_site: RunSite) -> None:
         for name in ("anna", "bert"):
             assert (await robots.channel.login(name, "rob", client_digest(name))).status == 200
 
-        async def create(user: str, tag: str) -> tuple[str, ...]:
-            reply = await robots.channel.client_request(f"{user}/rob", "CC", {"containerTag": tag})
-            return reply.errors
+        async def create(user: str, tag: str) -> ClientReply:
+            return await robots.channel.client_request(f"{user}/rob", "CC", {"containerTag": tag})
 
         answers = await asyncio.gather(*(create("anna", f"c{number}") for number in range(60)))
-        refused = [error for errors in answers for error in errors]
+        refused = [error for reply in answers for error in reply.errors]
+        assert {fault.code for reply in answers for fault in reply.faults} == {"busy"}
         assert 30 <= len(refused) < 60
         assert all("CC: too many requests" in error and "try again in" in error for error in refused)
-        assert await create("bert", "c") == ()
+        assert (await create("bert", "c")).errors == ()
+
+
+async def test_requests_of_robots_beyond_it_are_repeated(run_site: RunSite) -> None:
+    """A program that makes more at once than its user may has all of it at last."""
+    quotas = QuotaSettings(requests=5, request_burst=10)
+    wanted = {f"say{number}" for number in range(30)}
+    async with run_site(quotas=quotas) as site, robot_task_set(site.master.control_port, SECRET):
+        body = {"name": "anna", "password": "anna", "role": "user"}
+        await site.api("POST", "/users", body, status=201)
+        async with Connection(site.url, "anna", "anna", "rob") as conn:
+            await asyncio.gather(*(conn.publisher(tag, "std_msgs/String") for tag in wanted))
+            async with asyncio.timeout(60):
+                while not any("the engine is busy" in error for error in conn.errors):
+                    await asyncio.sleep(0.05)
+                made: set[str] = set()
+                while made != wanted:
+                    await asyncio.sleep(0.05)
+                    reply = await site.api("GET", "/interfaces", user="anna")
+                    made = {one["tag"] for one in reply["interfaces"]}
 
 
 async def test_streams(run_site: RunSite) -> None:

@@ -7,6 +7,8 @@ from support.master_cloud import Cloud, add, drain, wire
 
 from rce.control.desired import DesiredState, Fit
 from rce.control.messages import (
+    ClientReply,
+    ClientRequest,
     Drop,
     Fault,
     Gone,
@@ -190,3 +192,17 @@ async def test_logs_are_read_where_the_container_is(cloud: Cloud) -> None:
     containers.log = LogChunk(request=0, offset=0, text="away")
     with pytest.raises(TaskSetAwayError, match="did not answer"):
         await cloud.reconciler.read_log("anna/c", "n", 0, 10)
+
+
+@pytest.mark.parametrize(("most", "code"), [(None, "busy"), (1, "")])
+async def test_what_could_not_be_stored_can_be_repeated(cloud: Cloud, most: int | None, code: str) -> None:
+    """A full disk may have room later; what the store never takes is not to be repeated."""
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await robots.login()
+    cloud.store.most, cloud.store.broken = most, most is None
+    await robots.say(ClientRequest(request=99, id="anna/rob", type="CC", data={"containerTag": "c"}))
+    reply = await robots.get(ClientReply)
+    assert len(reply.errors) == 1
+    assert [fault.code for fault in reply.faults] == [code]
