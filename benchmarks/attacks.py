@@ -88,14 +88,27 @@ async def frames(url: str) -> None:
             await socket.send("{}")  # waits for room in the buffer
 
 
-async def requests(url: str) -> None:
-    """Requests of a thousand wrong items each, without a pause."""
+async def wrong_requests(url: str) -> None:
+    """Requests of 500 wrong items each, without a pause."""
     async with robot(url) as socket:
         reading = asyncio.create_task(drain(socket))
         item = {"endpointTag": "a0", "interfaceTag": "x", "interfaceType": "Nonsense", "className": "a/B"}
-        text = json.dumps({"type": "CN", "data": {"addInterfaces": [item] * 1000}})
+        text = json.dumps({"type": "CN", "data": {"addInterfaces": [item] * 500}})
         while not reading.done():
             await socket.send(text)
+
+
+async def changes(url: str) -> None:
+    """Requests that make and remove 500 interfaces, without a pause: the master does it, or refuses."""
+    async with robot(url) as socket:
+        reading = asyncio.create_task(drain(socket))
+        names = [{"endpointTag": "a0", "interfaceTag": f"i{number}"} for number in range(500)]
+        kind = {"interfaceType": "SubscriberConverter", "className": STRING}
+        made = json.dumps({"type": "CN", "data": {"addInterfaces": [{**name, **kind} for name in names]}})
+        gone = json.dumps({"type": "CN", "data": {"removeInterfaces": names}})
+        while not reading.done():
+            await socket.send(made)
+            await socket.send(gone)
 
 
 def images(picture: bytes) -> Attack:
@@ -168,30 +181,30 @@ async def binaries(url: str) -> None:
             await socket.send(b"%032x" % number + value)
 
 
-def kinds() -> dict[str, Attack]:
-    """All attacks by name."""
-    many = 199_000
-    return {
-        "too many elements": texts(data_message("[" + "[]," * 5_000_000 + "[]]")),
-        "many elements": texts(data_message("[" + "[]," * (many - 10) + "[]]")),
-        "many keys": texts(data_message("{" + ",".join(f'"k{n}":1' for n in range(many)) + "}")),
-        "many light texts": texts(data_message("[" + "[]," * 2000 + "[]]")),
-        "nested": texts(data_message("[" * 4000 + "]" * 4000)),
-        "10 MB strings": texts(data_message(json.dumps({"data": "x" * 10_000_000}))),
-        "15 MB of escapes": texts(data_message(json.dumps({"data": "\xe4" * 2_500_000}))),
-        "small frames": frames,
-        "requests": requests,
-        "images": images(png(4000, 4000)),
-        "image bombs": images(png_bomb()),
-        "slow reading": slow,
-        "half binaries": halves,
-        "binaries": binaries,
-    }
+_MANY = 199_000
+KINDS: dict[str, Callable[[], Attack]] = {
+    "too many elements": lambda: texts(data_message("[" + "[]," * 5_000_000 + "[]]")),
+    "many elements": lambda: texts(data_message("[" + "[]," * (_MANY - 10) + "[]]")),
+    "many keys": lambda: texts(data_message("{" + ",".join(f'"k{n}":1' for n in range(_MANY)) + "}")),
+    "many light texts": lambda: texts(data_message("[" + "[]," * 2000 + "[]]")),
+    "nested": lambda: texts(data_message("[" * 4000 + "]" * 4000)),
+    "10 MB strings": lambda: texts(data_message(json.dumps({"data": "x" * 10_000_000}))),
+    "15 MB of escapes": lambda: texts(data_message(json.dumps({"data": "\xe4" * 2_500_000}))),
+    "small frames": lambda: frames,
+    "wrong requests": lambda: wrong_requests,
+    "changes": lambda: changes,
+    "images": lambda: images(png(4000, 4000)),
+    "image bombs": lambda: images(png_bomb()),
+    "slow reading": lambda: slow,
+    "half binaries": lambda: halves,
+    "binaries": lambda: binaries,
+}
+"""Makes each attack, by its name."""
 
 
 async def attack(kind: str, url: str) -> None:
     """Attack until killed; reconnect after a disconnection."""
-    chosen = kinds()[kind]
+    chosen = KINDS[kind]()
     print("ready", flush=True)
     while True:
         with contextlib.suppress(ConnectionClosed, OSError):

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks import attacks
+
 Rows = Sequence[Mapping[str, Any]]
 
 RATIOS = {
@@ -196,6 +198,19 @@ _EXPLORATION = [
     )
 ]
 
+ABUSE_P99_MS = 20.0
+"""Most that another user's abuse may make of the round trips of a robot's 100 Hz probe."""
+_ABUSE = [
+    Target(
+        f"a robot's 100 Hz probe beside another user's abuse, {kind}, p99",
+        "abuse",
+        _column("p99 ms", abuse=kind),
+        ABUSE_P99_MS,
+        "ms",
+    )
+    for kind in attacks.KINDS
+]
+
 _STORE = [
     Target("etcd, three members: a save of one row, p50", "store.save", _column("p50_ms", rows=1), 3, "ms"),
     Target("etcd, three members: a save of 64 rows, p99", "store.save", _column("p99_ms", rows=64), 30, "ms"),
@@ -225,6 +240,7 @@ _SCALE = [
 TARGETS = [
     *_ROUND_TRIPS,
     *_IN_TLS,
+    *_ABUSE,
     Target(
         "messages of 64 B, 32 in flight, converter",
         "rate",

@@ -30,6 +30,7 @@ from rce.protocol import (
     InterfaceStatus,
     LargeData,
     LatchedSources,
+    LongRequest,
     encode,
 )
 from rce_client.desired import Desired, merge_removals
@@ -323,6 +324,7 @@ class Session:
                 | ConfigureComponents()
                 | ConfigureConnections()
                 | LargeData()
+                | LongRequest()
             ):
                 self._take_error(f"unexpected message {type(event).__name__}: only clients send it")
             case _:

@@ -26,7 +26,7 @@ from rce.protocol.messages import (
     type_of,
 )
 from rce.protocol.requests import MAX_ITEMS, read_request, write_request
-from rce.protocol.stream import Event, Fault, LargeData, ProtocolStream
+from rce.protocol.stream import Event, Fault, LargeData, LongRequest, ProtocolStream
 from rce.protocol.weight import Address, is_light, utf8_in_steps
 
 __all__ = [
@@ -50,6 +50,7 @@ __all__ = [
     "LargeData",
     "LatchedSources",
     "Limits",
+    "LongRequest",
     "MessageError",
     "ProtocolError",
     "ProtocolStream",

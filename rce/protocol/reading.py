@@ -193,8 +193,8 @@ def _may_hold_nan(text: str | bytes) -> bool:
     return b"NaN" in text or b"Infinity" in text
 
 
-def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMessage:
-    """Make a message of a parsed text frame whose binary values are in place.
+def kind_and_data(value: Any, accept: Collection[str]) -> tuple[str, Any]:
+    """Return the type and the ``data`` of a parsed message.
 
     Args:
         value: The JSON value.
@@ -212,7 +212,20 @@ def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMess
         raise MessageError("type", f"{problem}; use one of {known}")
     if "data" not in value:
         raise MessageError("data", "is missing")
-    data = value["data"]
+    return kind, value["data"]
+
+
+def message_from_json(value: Any, accept: Collection[str] = TYPES) -> ClientMessage:
+    """Make a message of a parsed text frame whose binary values are in place.
+
+    Args:
+        value: The JSON value.
+        accept: The types that the peer may send.
+
+    Raises:
+        MessageError: It is not a message, or one of another type.
+    """
+    kind, data = kind_and_data(value, accept)
     if kind in REQUEST_TYPES:
         return read_request(kind, data)
     if kind == "ER":

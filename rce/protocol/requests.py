@@ -5,7 +5,7 @@ Wire source: ``docs/protocol.md``.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rce.model import (
     AddInterface,
@@ -31,6 +31,9 @@ from rce.model import (
 from rce.model.spelling import Spelling, camel, short
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import REQUEST_TYPES
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
 
 SPELLING = Spelling(
     camel,
@@ -71,12 +74,39 @@ _LISTS: dict[type[Request], dict[str, type[Item]]] = {
 
 MAX_ITEMS = 512
 """Items of all lists of one ``CN`` or ``CX``: each is read on its own."""
+STEP_ITEMS = 16
+"""Items that are read in one step, in about half a millisecond."""
 _MAX_FAULTS = 32
 """Wrong items of one ``CN`` or ``CX`` after which no more are read."""
 
 
+def is_long(kind: str, data: Any) -> bool:
+    """Return whether a request is long enough for :func:`read_in_steps`."""
+    lists = _LISTS.get(REQUEST_TYPES[kind])
+    return lists is not None and isinstance(data, dict) and _count(data, lists) > STEP_ITEMS
+
+
 def read_request(kind: str, data: Any) -> Request:
     """Make a request from its type and its ``data``.
+
+    Raises:
+        MessageError: ``kind`` is not a request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
+            ``CX`` do not raise: they are in ``faults``.
+    """
+    reading = read_in_steps(kind, data)
+    while True:
+        try:
+            next(reading)
+        except StopIteration as end:
+            request: Request = end.value
+            return request
+
+
+def read_in_steps(kind: str, data: Any) -> Generator[None, None, Request]:
+    """Make a request as :func:`read_request` does; stop after each few items.
+
+    Returns:
+        The request.
 
     Raises:
         MessageError: ``kind`` is not a request, or ``data`` as a whole is wrong. Wrong items of a ``CN`` or
@@ -88,7 +118,7 @@ def read_request(kind: str, data: Any) -> Request:
     if not isinstance(data, dict):
         raise MessageError("data", f"must be an object, not {kind_of(data)}")
     if cls in _LISTS:
-        return cls(**_read_lists(data, _LISTS[cls]))
+        return cls(**(yield from _read_lists(data, _LISTS[cls])))
     try:
         return SPELLING.read(cls, data, ("data",))
     except SpecError as error:
@@ -110,9 +140,13 @@ def kind_of(value: Any) -> str:
     return names.get(type(value), "a number" if isinstance(value, int | float) else "binary")
 
 
-def _read_lists(data: dict[str, Any], lists: dict[str, type[Item]]) -> dict[str, Any]:
+def _count(data: dict[str, Any], lists: dict[str, type[Item]]) -> int:
+    return sum(len(items) for name in lists if isinstance(items := data.get(camel(name)), list))
+
+
+def _read_lists(data: dict[str, Any], lists: dict[str, type[Item]]) -> Generator[None, None, dict[str, Any]]:
     """Read each item of each list on its own, so that a wrong one does not affect the others."""
-    count = sum(len(items) for name in lists if isinstance(items := data.get(camel(name)), list))
+    count = _count(data, lists)
     if count > MAX_ITEMS:
         raise MessageError(
             "data",
@@ -136,6 +170,8 @@ def _read_lists(data: dict[str, Any], lists: dict[str, type[Item]]) -> dict[str,
                 problem = f"the last {len(items) - index} items were not read, too many are wrong"
                 faults.append(FieldFault(place, FaultCode.LIMIT, problem))
                 break
+            if index % STEP_ITEMS == STEP_ITEMS - 1:
+                yield
             try:
                 good.append(SPELLING.read(cls, item, (*place, index)))
             except SpecError as error:

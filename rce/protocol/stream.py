@@ -16,7 +16,15 @@ from rce.protocol.assembler import Assembler, Binary, Dropped
 from rce.protocol.calls import call_at, call_of
 from rce.protocol.exceptions import MessageError, ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
-from rce.protocol.messages import DOWNWARD, UPWARD, CallId, ClientMessage, DataMessage, ErrorReport
+from rce.protocol.messages import (
+    DOWNWARD,
+    REQUEST_TYPES,
+    UPWARD,
+    CallId,
+    ClientMessage,
+    DataMessage,
+    ErrorReport,
+)
 from rce.protocol.reading import (
     SerializedData,
     check_depth,
@@ -24,14 +32,16 @@ from rce.protocol.reading import (
     decode_data,
     decode_serialized,
     is_shallow,
+    kind_and_data,
     message_from_json,
     parse_json,
 )
+from rce.protocol.requests import is_long, read_in_steps
 from rce.protocol.single import MARK, SingleReader
 from rce.protocol.weight import Address, find_address, is_light
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Generator
     from typing import Self
 
 
@@ -92,7 +102,25 @@ class LargeData(Struct, frozen=True):
         return len(self.text) + sum(map(len, self.binaries.values()))
 
 
-Event: TypeAlias = ClientMessage | LargeData | Fault
+class LongRequest(Struct, frozen=True):
+    """A request of so many items that it takes too long to be read in one piece."""
+
+    kind: str
+    data: Any
+
+    def read(self) -> Generator[None, None, ClientMessage | Fault]:
+        """Read it, and stop after each few items.
+
+        Returns:
+            The request, or its fault.
+        """
+        try:
+            return (yield from read_in_steps(self.kind, self.data))
+        except ProtocolError as error:
+            return Fault.of(error, None)
+
+
+Event: TypeAlias = ClientMessage | LargeData | LongRequest | Fault
 """An output of a stream."""
 
 
@@ -158,7 +186,7 @@ class ProtocolStream:
 
     @classmethod
     def for_engine(cls, limits: Limits = DEFAULT_LIMITS, *, single: bool = False) -> Self:
-        """Make the engine's side, which reads messages of clients, and returns large ones unparsed.
+        """Make the engine's side, which reads messages of clients, and returns large and long ones unread.
 
         Args:
             limits: Limits on the peer's data.
@@ -229,7 +257,7 @@ class ProtocolStream:
             if len(text) > limits.max_request:
                 check_request_size(value, len(text), limits.max_request)
             if not starred:
-                return [message_from_json(value, self._accept)]
+                return [self._read(value)]
             complete, dropped = self._assembler.add_message(value, len(text), now)
         except ProtocolError as error:
             return [Fault.of(error, call_of(value))]
@@ -318,9 +346,16 @@ class ProtocolStream:
             message: Event = value.message()
             return message
         try:
-            return message_from_json(value, self._accept)
+            return self._read(value)
         except ProtocolError as error:
             return Fault.of(error, call_of(value))
+
+    def _read(self, value: Any) -> Event:
+        if self._defer_large:
+            kind, data = kind_and_data(value, self._accept)
+            if kind in REQUEST_TYPES and is_long(kind, data):
+                return LongRequest(kind, data)
+        return message_from_json(value, self._accept)
 
 
 def _fault(dropped: Dropped) -> Fault:

@@ -33,6 +33,7 @@ from rce.protocol import (
     LargeData,
     LatchedSources,
     Limits,
+    LongRequest,
     ProtocolStream,
     encode,
     is_light,
@@ -276,15 +277,14 @@ class Session:
     # From the robot: rce_robot.doors.client.websocket.Receiver
 
     def on_text(self, text: bytes) -> Iterator[None] | None:
-        """Handle a text frame, a large one in steps."""
+        """Handle a text frame, a large one or a long request in steps."""
         if len(text) >= LARGE_TEXT:
             return self._handle_in_steps(text)
         events = self._stream.feed_text(text, self._now())
         if _has_fault(events) and not all(utf8_in_steps(text)):
             self._refuse_text()
-        else:
-            self._handle_events(events, len(text))
-        return None
+            return None
+        return self._handle_events(events, len(text))
 
     def _handle_in_steps(self, text: bytes) -> Iterator[None]:
         light = is_light(text)
@@ -297,21 +297,31 @@ class Session:
                     self._refuse_text()
                     return
                 yield
-        self._handle_events(events, len(text))
+        rest = self._handle_events(events, len(text))
+        if rest is not None:
+            yield from rest
 
-    def _handle_events(self, events: Sequence[Event], size: int) -> None:
-        for event in events:
+    def _handle_events(self, events: Sequence[Event], size: int) -> Iterator[None] | None:
+        for index, event in enumerate(events):
+            if type(event) is LongRequest:
+                return self._read_long(event, events[index + 1 :], size)
             self._handle(event, size)
         self._check_pending()
+        return None
+
+    def _read_long(self, request: LongRequest, others: Sequence[Event], size: int) -> Iterator[None]:
+        """Read and handle a long request in steps, then other events."""
+        self._handle((yield from request.read()), size)
+        rest = self._handle_events(others, size)
+        if rest is not None:
+            yield from rest
 
     def _refuse_text(self) -> None:
         self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
 
-    def on_binary(self, data: bytes) -> None:
-        """Handle a binary frame."""
-        for event in self._stream.feed_binary(data, self._now()):
-            self._handle(event)
-        self._check_pending()
+    def on_binary(self, data: bytes) -> Iterator[None] | None:
+        """Handle a binary frame, a long request that waited for it in steps."""
+        return self._handle_events(self._stream.feed_binary(data, self._now()), 0)
 
     def on_part(self) -> None:
         """Count a large message that is still being received."""
@@ -367,17 +377,12 @@ class Session:
     def _handle(self, event: Event, size: int = 0) -> None:
         match event:
             case DataMessage():
-                try:
-                    self._owner.take(event)
-                except RobotError as error:
-                    self.report(error.problem, error.call)
-                except Exception:  # noqa: BLE001 - logged; it must not end anything else
-                    _log.exception("data message at %s", event.i_tag)
-                    problem = "internal error; the engine's log tells more"
-                    fault = RobotError.at(event.i_tag, event.msg_id, problem)
-                    self.report(fault.problem, fault.call)
+                self._take(event)
             case LargeData():
                 self._handle_large(event)
+            case LongRequest():
+                for _ in self._read_long(event, (), size):
+                    pass
             case LatchedSources():
                 self._owner.keep_latched(event.i_tag, event.sources)
             case Fault():
@@ -396,6 +401,17 @@ class Session:
                 self._requests.put(event, size)
             case _:
                 assert_never(event)
+
+    def _take(self, message: DataMessage) -> None:
+        try:
+            self._owner.take(message)
+        except RobotError as error:
+            self.report(error.problem, error.call)
+        except Exception:  # noqa: BLE001 - logged; it must not end anything else
+            _log.exception("data message at %s", message.i_tag)
+            problem = "internal error; the engine's log tells more"
+            fault = RobotError.at(message.i_tag, message.msg_id, problem)
+            self.report(fault.problem, fault.call)
 
     def _handle_large(self, large: LargeData) -> None:
         try:

@@ -74,8 +74,8 @@ class Receiver(Protocol):
             The remaining work, in steps between which others have their turns; None if it is done.
         """
 
-    def on_binary(self, data: bytes) -> None:
-        """Handle a binary message."""
+    def on_binary(self, data: bytes) -> Iterator[None] | None:
+        """Handle a binary message; the result is that of :meth:`on_text`."""
 
     def on_part(self) -> None:
         """Handle a part of a large message; :attr:`RobotSocket.held` grew."""
@@ -371,18 +371,16 @@ class RobotSocket(WatchedConnection, GuardedConnection):
             self.fail(CloseCode.PROTOCOL_ERROR, "a message came before the handshake was answered")
         elif self._work:
             self._add_work(self._handle(opcode, data), len(data))
-        elif opcode is not Opcode.TEXT:
-            self.receiver.on_binary(data)
-        elif (rest := self.receiver.on_text(data)) is not None:
+        elif (rest := self._receive(self.receiver, opcode, data)) is not None:
             self._add_work(rest, len(data))
 
     def _handle(self, opcode: Opcode, data: bytes) -> Iterator[None]:
-        if self.receiver is None:
-            return
-        if opcode is not Opcode.TEXT:
-            self.receiver.on_binary(data)
-        elif (rest := self.receiver.on_text(data)) is not None:
+        if self.receiver is not None and (rest := self._receive(self.receiver, opcode, data)) is not None:
             yield from rest
+
+    @staticmethod
+    def _receive(receiver: Receiver, opcode: Opcode, data: bytes) -> Iterator[None] | None:
+        return receiver.on_text(data) if opcode is Opcode.TEXT else receiver.on_binary(data)
 
     def _add_work(self, work: Iterator[None], size: int) -> None:
         self._work.append((work, size))

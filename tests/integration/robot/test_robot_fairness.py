@@ -87,6 +87,33 @@ async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
                 await (await good.ping())
 
 
+async def test_long_requests_that_are_read_in_steps_keep_their_order() -> None:
+    """A message of another robot passes before all are read; what comes behind a request waits for it."""
+    item = {"endpointTag": "r", "interfaceType": "PublisherConverter", "className": STRING}
+    items = [{**item, "interfaceTag": f"i{number}"} for number in range(500)]
+    async with running_cloud(PATIENT) as cloud:
+        end = await cloud.joined("tag", "SubscriberConverter", STRING)
+        requests = cloud.master.requests
+        async with dial(cloud, "testUser", "long") as long, dial(cloud, "testUser", "testRobot") as good:
+            await end.until_active()
+            for number in range(100):
+                binary = f"{number:032d}"
+                more = (
+                    {"setParam": [{"containerTag": "c", "name": "p", "value*": binary}]} if number % 2 else {}
+                )
+                await long.send(json.dumps({"type": "CN", "data": {"addInterfaces": items, **more}}))
+                if more:
+                    await long.send(binary.encode())
+                await long.send(json.dumps({"type": "DC", "data": {"containerTag": f"c{number}"}}))
+            await good.send(say('{"data":"hello"}'))
+            async with asyncio.timeout(60):
+                await end.received.get()
+            assert sum(kind == "DC" for _, kind, _ in requests) < 100
+            await until(lambda: len(requests) == 200, timeout=120, what="all requests are there")
+        assert [kind for _, kind, _ in requests] == ["CN", "DC"] * 100
+        assert {len(data["addInterfaces"]) for _, kind, data in requests if kind == "CN"} == {500}
+
+
 async def test_pings_of_a_robot_that_does_not_read_are_not_kept() -> None:
     """The newest is answered when it reads again."""
     async with running_cloud(PATIENT) as cloud, dial(cloud, "testUser", "robot") as robot:

@@ -15,7 +15,8 @@ from rce.model.requests import ConfigureComponents, CreateContainer
 from rce.protocol.codec import Frame, encode, encode_data, encode_message
 from rce.protocol.limits import Limits
 from rce.protocol.messages import DataMessage, InterfaceStatus
-from rce.protocol.stream import Event, Fault, ProtocolStream
+from rce.protocol.requests import MAX_ITEMS, STEP_ITEMS, read_request
+from rce.protocol.stream import Event, Fault, LongRequest, ProtocolStream
 
 ID = "0123456789abcdef0123456789ABCDEF"
 OTHER = "f" * 32
@@ -111,6 +112,42 @@ def test_sides_take_only_their_types() -> None:
     assert fault.text == "type: unknown message type 'ST'; use one of CC, CN, CX, DC, DM, LT, RC"
     assert fault.report.path == ("type",)
     assert isinstance(ProtocolStream.for_client().feed(create, 0.0)[0], Fault)
+
+
+def interfaces(count: int) -> dict[str, Any]:
+    item = {"endpointTag": "e", "interfaceType": "PublisherConverter", "className": "a/B"}
+    items = [{**item, "interfaceTag": f"i{number}"} for number in range(count)]
+    return {"addInterfaces": items, "removeInterfaces": [{"endpointTag": "e", "interfaceTag": "gone"}]}
+
+
+def test_long_request_is_read_in_steps() -> None:
+    """What a robot sends must not hold the loop; the same comes out as in one piece."""
+    data = interfaces(MAX_ITEMS - 1)
+    data["addInterfaces"][20]["className"] = "wrong"
+    (event,) = ProtocolStream.for_engine().feed(json.dumps({"type": "CN", "data": data}), 0.0)
+    assert isinstance(event, LongRequest)
+    reading, steps = event.read(), 0
+    try:
+        while True:
+            next(reading)
+            steps += 1
+    except StopIteration as end:
+        request = end.value
+    assert steps >= MAX_ITEMS / STEP_ITEMS - 1
+    assert request == read_request("CN", data)
+    assert [fault.path for fault in request.faults] == [("data", "addInterfaces", 20, "className")]
+    assert len(request.add_interfaces) == MAX_ITEMS - 2
+
+
+def test_too_long_a_request_is_one_fault() -> None:
+    (event,) = ProtocolStream.for_engine().feed(
+        json.dumps({"type": "CN", "data": interfaces(MAX_ITEMS)}), 0.0
+    )
+    assert isinstance(event, LongRequest)
+    with pytest.raises(StopIteration) as end:
+        next(event.read())
+    assert isinstance(end.value.value, Fault)
+    assert f"{MAX_ITEMS + 1} items are over the limit of {MAX_ITEMS}" in end.value.value.text
 
 
 def test_components_with_binary_value_are_reported_as_an_item() -> None:
