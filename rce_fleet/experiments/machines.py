@@ -34,7 +34,8 @@ MIN_BURST_BYTES = 3200
 """Two Ethernet frames: with less, ``tbf`` passes none."""
 BURST_S = 0.004
 """The longest burst at full speed, seconds at the limited rate: the kernel's clock ticks that often."""
-START_S = 20.0
+START_S = 60.0
+"""Seconds for a program on a machine to start or to answer, also on a busy computer."""
 TOOLS = ("ip", "tc", "setpriv")
 """Programs by which machines and the programs on them are made."""
 _ENDED_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL")
@@ -222,7 +223,11 @@ class MachineNetwork:
             emulator.stdin.write(f"{order}\n".encode())
             async with asyncio.timeout(START_S):
                 answer = await emulator.stdout.readline()
-        except (OSError, TimeoutError) as error:
+        except TimeoutError as error:
+            raise ExperimentError(
+                f"the emulator of {name}'s link does not answer within {START_S:g} s"
+            ) from error
+        except OSError as error:
             raise ExperimentError(f"the emulator of {name}'s link does not answer: {error}") from error
         if not answer:
             raise ExperimentError(f"the emulator of {name}'s link has ended")
@@ -242,8 +247,14 @@ class MachineNetwork:
         )
         try:
             assert server.stdout is not None
-            async with asyncio.timeout(START_S):
-                await server.stdout.readline()
+            try:
+                async with asyncio.timeout(START_S):
+                    await server.stdout.readline()
+            except TimeoutError as error:
+                raise ExperimentError(
+                    f"the link of {name} cannot be measured: the program on {other} did not start within"
+                    f" {START_S:g} s"
+                ) from error
             asking = (*self.machines[name].prefix, *_ENDED_WITH_PARENT, *command)
             shown = await _run(*asking, "measure", target.address)
         finally:

@@ -133,10 +133,10 @@ def by_condition(rows: Iterable[Row], metric: str) -> Mapping[Condition, list[fl
 
 
 def error_text(error: Exception) -> str:
-    """Return an error's text; of an error of the system, the file and the reason."""
+    """Return an error's text; of an error of the system, the file and the reason; never an empty one."""
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return str(error)
+    return str(error) or type(error).__name__
 
 
 def joined_factors(factors: tuple[tuple[str, str], ...]) -> str:

@@ -34,4 +34,5 @@ def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     for line in process.stdout:
         if ", run 1 " in line:
             return process
+    process.stdout.close()
     raise AssertionError(f"no run was begun: {process.wait()}")
