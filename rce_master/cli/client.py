@@ -17,6 +17,7 @@ import typer
 from rce.masters import Masters
 from rce.tls import CertificateError, client_context, explain_to_client
 from rce.web.client import Sent, noting_sent, session_connector
+from rce_master.cli.attempts import Attempts
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
@@ -30,19 +31,23 @@ if TYPE_CHECKING:
     from rce_master.cli.credentials import Credentials
 
 REQUEST_S = 30.0
+CONNECT_S = 3.0
+"""The same for a connection to one of several masters: a machine that is off answers nothing."""
+ANSWER_S = 5.0
+"""How long one of several masters may be silent before another one is asked that was not asked yet."""
+STREAM_S = 35.0
+"""How long a stream of events may be silent; a master writes to it every 15 s."""
 UPLOAD_S = 300.0
 """Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
-REPEAT_S = 30.0
-"""How long a POST whose answer was lost is repeated: another master may have to take the lead."""
-LEADER_S = 8.0
-"""How long a request waits for a leading master, if a stand-by answers."""
 IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000
 _OK = 400
 _REDIRECTS = 300, 400
 _NOT_NOW = (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
 """Statuses of a master that has no leader just now."""
+_REPEATED = ("GET", "POST")
+"""Methods of requests that may be sent again: they change nothing, or are done once by their keys."""
 _CLOSE = aiohttp.ClientWSTimeout(ws_close=5.0)
 
 
@@ -59,6 +64,8 @@ class ApiClient:
         self._authority = authority
         self._masters = Masters(url)
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._answered = ""
+        """The master that answered last."""
 
     @classmethod
     def of(cls, credentials: Credentials) -> ApiClient:
@@ -95,7 +102,8 @@ class ApiClient:
     ) -> Any:
         """Make a request. A POST whose answer is lost is repeated, with the key by which it is done once.
 
-        While the lead changes, it is repeated as long as the masters say that nothing was done.
+        While the lead changes, it is repeated as long as the masters say that nothing was done. A master that
+        does not answer is passed over for the next one; what cannot be repeated is sent to one that answers.
 
         Returns:
             What came back, or None if nothing did.
@@ -104,16 +112,14 @@ class ApiClient:
             ApiError: The master refused.
             CliError: The master could not be reached.
         """
+        if method not in _REPEATED:
+            await self._find_master()
         headers = {IDEMPOTENCY_KEY: f'"{uuid.uuid4()}"'} if method == "POST" else {}
-        untried = len(self._masters.all)
-        end: float | None = None
-        """Until when a lost answer is asked for; None: none was lost."""
-        led: float | None = None
-        """Until when a leading master is waited for; None: none was missed."""
-        clock = asyncio.get_running_loop().time
+        attempts = Attempts(method, len(self._masters.all), asyncio.get_running_loop().time)
         while True:
+            if attempts.begin():
+                await asyncio.sleep(RETRY_S)
             url = self._masters.current
-            untried -= 1
             sent = Sent()
             try:
                 async with self._session.request(
@@ -124,25 +130,14 @@ class ApiClient:
                     headers=headers,
                     allow_redirects=False,
                     trace_request_ctx=sent,
+                    timeout=self._timeout(None if attempts.is_patient else ANSWER_S),
                 ) as reply:
-                    if headers and _may_be_done(reply) and end is None:
-                        end = clock() + REPEAT_S
-                    if _is_unled(reply, method):
-                        led = led or clock() + LEADER_S
-                        again = untried > 0 or clock() < led
-                    else:
-                        again = False
-                    if not again and not (end is not None and _is_undecided(reply) and clock() < end):
+                    self._answered = url
+                    if not attempts.answered(reply.status, reply.headers):
                         return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
-                # Only without a connection it is certain that the request had no effect.
-                unsent = isinstance(error, aiohttp.ClientConnectorError) and (
-                    method == "GET" or not sent.begun
-                )
-                if headers and not unsent and end is None:
-                    end = clock() + REPEAT_S
-                others = untried > 0 or (led is not None and clock() < led)
-                if not (unsent and others) and (end is None or clock() >= end):
+                self._answered = ""
+                if not attempts.failed(sent=sent.begun, late=isinstance(error, TimeoutError)):
                     warning = (
                         "; it may have done this or not: look first" if sent.begun and method != "GET" else ""
                     )
@@ -150,9 +145,28 @@ class ApiClient:
                         f"cannot use the master at {self._base}: {_words(error)}{warning}"
                     ) from error
             self._masters.failed(url)
-            if untried <= 0:
-                await asyncio.sleep(RETRY_S)
-                untried = len(self._masters.all)
+
+    def _timeout(self, silence: float | None = None) -> aiohttp.ClientTimeout:
+        """Return the limits of a request; ``silence`` is that of a pause in its answer, in seconds."""
+        connect = CONNECT_S if self._masters.has_others else None
+        return aiohttp.ClientTimeout(total=REQUEST_S, sock_connect=connect, sock_read=silence)
+
+    async def _find_master(self) -> None:
+        """Turn to a master that answers, for what is sent once only; any answer will do.
+
+        If none answers, the request itself tells why.
+        """
+        for _ in self._masters.all if self._masters.has_others else ():
+            url = self._masters.current
+            if url == self._answered:
+                return
+            try:
+                async with self._session.get(
+                    f"{url.rstrip('/')}/healthz", allow_redirects=False, timeout=self._timeout(ANSWER_S)
+                ):
+                    self._answered = url
+            except (aiohttp.ClientError, TimeoutError):
+                self._masters.failed(url)
 
     async def items(
         self, path: str, name: str = "", query: dict[str, str | int] | None = None
@@ -211,6 +225,7 @@ class ApiClient:
     ) -> aiohttp.ClientWebSocketResponse:
         """Open a WebSocket at the leading master, which a stand-by names."""
         for number in range(len(self._masters.all), -1, -1):
+            await self._find_master()
             url = self._masters.current
             try:
                 return await self._session.ws_connect(
@@ -247,7 +262,7 @@ class ApiClient:
         """
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=UPLOAD_S)
         headers = {"Content-Type": "application/gzip"}
-        if len(self._masters.all) > 1:
+        if self._masters.has_others:
             # A file is sent once; this finds a master that answers.
             await self.call("GET", "/user")
         try:
@@ -283,47 +298,28 @@ class ApiClient:
             except (aiohttp.ClientError, TimeoutError, ApiError) as error:
                 if isinstance(error, ApiError) and error.status not in _NOT_NOW:
                     raise
-                self._masters.failed(url)
                 untried -= 1
                 if not reached and last is None and untried <= 0:
                     if isinstance(error, ApiError):
                         raise
                     raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+                self._masters.failed(url)
             await asyncio.sleep(RETRY_S)
 
     async def _stream(self, last: int | None) -> AsyncIterator[Event]:
         headers = {} if last is None else {"Last-Event-ID": str(last)}
-        timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=2 * REQUEST_S)
-        async with self._session.get(
-            f"{self._base}/events", headers=headers, timeout=timeout, allow_redirects=False
-        ) as reply:
+        connect, answer = (CONNECT_S, ANSWER_S) if self._masters.has_others else (REQUEST_S, REQUEST_S)
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=connect, sock_read=STREAM_S)
+        async with asyncio.timeout(answer):
+            reply = await self._session.get(
+                f"{self._base}/events", headers=headers, timeout=timeout, allow_redirects=False
+            )
+        async with reply:
             if reply.status >= _OK:
                 await _result(reply)
             async for line in reply.content:
                 if line.startswith(b"data: "):
                     yield msgspec.json.decode(line[6:], type=Event)
-
-
-def _may_be_done(reply: aiohttp.ClientResponse) -> bool:
-    """Return whether a request may have been done that was not answered with its result."""
-    if reply.status == HTTPStatus.SERVICE_UNAVAILABLE:  # by a leader that ends; a stand-by does nothing
-        return "Retry-After" in reply.headers and STANDBY_HEADER not in reply.headers
-    return reply.status == HTTPStatus.BAD_GATEWAY
-
-
-def _is_unled(reply: aiohttp.ClientResponse, method: str) -> bool:
-    """Return whether a request found no leading master, and did nothing or only reads."""
-    if STANDBY_HEADER in reply.headers:
-        return True
-    is_ending = reply.status == HTTPStatus.SERVICE_UNAVAILABLE and "Retry-After" in reply.headers
-    return method == "GET" and is_ending
-
-
-def _is_undecided(reply: aiohttp.ClientResponse) -> bool:
-    """Return whether an answer leaves open if a request was done that was sent before."""
-    status = reply.status
-    is_under_way = status == HTTPStatus.CONFLICT and "Retry-After" in reply.headers
-    return is_under_way or status in _NOT_NOW
 
 
 def _words(error: Exception) -> str:

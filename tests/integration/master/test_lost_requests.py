@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -11,6 +10,7 @@ import aiohttp
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from support.absent_masters import silent_master, unreachable_port
 from support.ports import free_port
 
 from rce.guard import TrustedProxies
@@ -23,35 +23,19 @@ from rce_master.store.etcd.layout import Leader
 
 @asynccontextmanager
 async def ending_master() -> AsyncIterator[str]:
-    """Give the address of a master that ends as soon as it has got a request."""
+    """Give the address of a master that ends as soon as it has got a request, but for one of its health."""
 
     async def end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readuntil(b"\r\n\r\n")
+        if (await reader.readuntil(b"\r\n\r\n")).startswith(b"GET /healthz "):
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+            writer.close()
+            return
         server.close()
         writer.transport.abort()
 
     server = await asyncio.start_server(end, "127.0.0.1", 0)
     try:
         yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
-    finally:
-        server.close()
-
-
-@asynccontextmanager
-async def silent_master() -> AsyncIterator[tuple[str, asyncio.Event]]:
-    """Give the address of a master that answers nothing, and what is set when it has got a request."""
-    asked = asyncio.Event()
-
-    async def take(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(asyncio.IncompleteReadError):
-            await reader.readuntil(b"\r\n\r\n")
-            asked.set()
-            await reader.read()
-        writer.transport.abort()
-
-    server = await asyncio.start_server(take, "127.0.0.1", 0)
-    try:
-        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/", asked
     finally:
         server.close()
 
@@ -161,7 +145,7 @@ async def test_rce_waits_while_the_lead_is_handed_over(method: str, monkeypatch:
     ended = f"http://127.0.0.1:{free_port()}/"
     async with TestServer(app) as server, ApiClient(f"{ended},{server.make_url('/')}") as client:
         assert await client.call(method, "/containers/a") == {"tag": "a"}
-        monkeypatch.setattr("rce_master.cli.client.LEADER_S", 0.0)
+        monkeypatch.setattr("rce_master.cli.attempts.LEADER_S", 0.0)
         answered.clear()
         async with ApiClient(str(server.make_url("/"))) as other:
             with pytest.raises(ApiError, match="no master leads"):
@@ -186,3 +170,125 @@ async def test_rce_repeats_what_it_wanted_to_read_from_a_leader_that_ends(
         asked.clear()
         with pytest.raises(ApiError, match="ask again"):
             await client.call("DELETE", "/containers")  # it may have been done
+
+
+class Answering:
+    """A master that counts what it is asked, but for its health."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.keys: set[str] = set()
+
+    async def answer(self, request: web.Request) -> web.StreamResponse:
+        if request.path == "/healthz":
+            return web.json_response({})
+        self.asked.append(f"{request.method} {request.path.removeprefix('/api/v1')}")
+        self.keys.add(request.headers.get(IDEMPOTENCY_KEY, ""))
+        if request.path.endswith("/exec"):
+            socket = web.WebSocketResponse()
+            await socket.prepare(request)
+            await socket.close()
+            return socket
+        if request.path.endswith("/events"):
+            return web.Response(text='data: {"id":1,"time":1,"kind":"k","user":"u","subject":"u/c"}\n\n')
+        return web.json_response({"tag": "a"})
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[str]:
+        app = web.Application()
+        app.router.add_route("*", "/{rest:.*}", self.answer)
+        async with TestServer(app) as server:
+            yield str(server.make_url("/"))
+
+
+@asynccontextmanager
+async def absent_master(fault: str) -> AsyncIterator[str]:
+    if fault == "unreachable":
+        with unreachable_port() as port:
+            yield f"http://127.0.0.1:{port}/"
+    else:
+        async with silent_master() as (url, _):
+            yield url
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each master have little time, and the whole of a request much more than a test has."""
+    monkeypatch.setattr("rce_master.cli.client.REQUEST_S", 600.0)
+    monkeypatch.setattr("rce_master.cli.client.CONNECT_S", 1.0)
+    monkeypatch.setattr("rce_master.cli.client.ANSWER_S", 1.0)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("fault", ["silent", "unreachable"])
+@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE"])
+async def test_the_next_master_is_asked_if_one_is_absent(method: str, fault: str) -> None:
+    """It answers nothing at all: its program is stopped, or its machine is off."""
+    master = Answering()
+    async with (
+        absent_master(fault) as absent,
+        master.running() as url,
+        ApiClient(f"{absent},{absent},{url}") as client,
+        asyncio.timeout(60),
+    ):
+        assert await client.call(method, "/containers/a") == {"tag": "a"}
+        assert await client.call(method, "/containers/b") == {"tag": "a"}
+    assert master.asked == [f"{method} /containers/a", f"{method} /containers/b"]
+    assert len(master.keys) == (2 if method == "POST" else 1)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("fault", ["silent", "unreachable"])
+async def test_streams_find_a_master_that_answers(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_master.cli.client.RETRY_S", 0.0)
+    master = Answering()
+    async with absent_master(fault) as absent, master.running() as url, asyncio.timeout(60):
+        async with (
+            ApiClient(f"{absent},{url}") as client,
+            client.websocket("/exec", {}, 1 << 20) as socket,
+        ):
+            await socket.receive()
+        async with ApiClient(f"{absent},{url}") as client:
+            async for event in client.events():
+                assert event.id == 1
+                break
+    assert master.asked == ["GET /exec", "GET /events"]
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_a_slow_master_is_asked_again_with_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_master.cli.client.RETRY_S", 0.0)
+    asked: list[str] = []
+
+    async def answer(request: web.Request) -> web.Response:
+        asked.append(request.path)
+        if len(asked) <= 2:
+            await asyncio.Event().wait()  # until the client has given up
+        await asyncio.sleep(1.5)
+        return web.json_response({})
+
+    app = web.Application()
+    app.router.add_get("/api/v1/user", answer)
+    async with TestServer(app) as server, asyncio.timeout(60):
+        url = str(server.make_url("/"))
+        async with ApiClient(f"{url},{url}") as client:
+            await client.call("GET", "/user")
+    assert len(asked) == 3
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_what_a_silent_master_may_have_done_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answered before, and hangs now: what was sent is not sent to another master."""
+    monkeypatch.setattr("rce_master.cli.client.REQUEST_S", 0.5)
+    master = Answering()
+    async with (
+        silent_master() as (silent, asked),
+        master.running() as url,
+        ApiClient(f"{silent},{url}") as client,
+        asyncio.timeout(60),
+    ):
+        client._answered = silent
+        with pytest.raises(CliError, match=f"{silent}api/v1.*it may have done this or not: look first"):
+            await client.call("DELETE", "/containers/a")
+        assert asked.is_set()
+    assert master.asked == []
