@@ -44,7 +44,9 @@ def split_port(address: str, default: int) -> tuple[str, int]:
 
 
 class Masters:
-    """Addresses that are used in turn: after a failure the next one is used.
+    """Addresses of which one stays in use until it fails; then the others are used in turn.
+
+    A connection that worked and ended is no failure: its master is tried first, and the others after it.
 
     Args:
         addresses: One or several; in a text they are separated by commas.
@@ -58,6 +60,7 @@ class Masters:
         masters.current  # http://one:9000/
         masters.failed("http://one:9000/")
         masters.current  # http://two:9000/
+        masters.worked()
         ```
     """
 
@@ -66,6 +69,8 @@ class Masters:
         if not self.all:
             raise ValueError("give the address of a master, or several, separated by commas")
         self._index = 0
+        self._failures = 0
+        """Of masters, since one worked."""
 
     def __str__(self) -> str:
         return ",".join(self.all)
@@ -75,7 +80,22 @@ class Masters:
         """The address to use now."""
         return self.all[self._index]
 
+    @property
+    def has_others(self) -> bool:
+        """Whether there is more than one address."""
+        return len(self.all) > 1
+
+    @property
+    def has_untried(self) -> bool:
+        """Whether another address has not failed since a master worked: a slow one need not be waited for."""
+        return self._failures + 1 < len(self.all)
+
     def failed(self, address: str) -> None:
         """Switch to the next address, if ``address`` is still in use."""
         if address == self.current:
             self._index = (self._index + 1) % len(self.all)
+            self._failures += 1
+
+    def worked(self) -> None:
+        """Note that the master in use does what it is asked: its address stays in use until it fails."""
+        self._failures = 0

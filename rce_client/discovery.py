@@ -44,6 +44,7 @@ async def locate(
     version: str = VERSION,
     tls: ssl.SSLContext | None = None,
     timeout: float = 10.0,
+    connect: float | None = None,
 ) -> Endpoint:
     """Ask the master at ``url`` for a robot endpoint.
 
@@ -53,6 +54,7 @@ async def locate(
         version: Protocol version that this client speaks.
         tls: TLS settings for ``https``; the system's if None.
         timeout: Seconds for the whole exchange.
+        connect: Seconds of them for the TCP connection; None: all.
 
     Raises:
         RefusedError: The master refuses this client, or the URL is not valid.
@@ -71,8 +73,10 @@ async def locate(
     try:
         async with asyncio.timeout(timeout):
             is_https = parts.scheme == "https"
+            async with asyncio.timeout(connect):
+                sock = await open_socket(parts.hostname, port)
             reader, writer = await asyncio.open_connection(
-                sock=await open_socket(parts.hostname, port),
+                sock=sock,
                 ssl=(tls or True) if is_https else None,
                 server_hostname=parts.hostname if is_https else None,
             )

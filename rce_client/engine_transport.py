@@ -100,6 +100,10 @@ class Timing:
 
     locate: float = 10.0
     """Seconds for the master's answer."""
+    locate_next: float = 5.0
+    """The same if another master is named that has not failed yet."""
+    connect: float = 3.0
+    """Seconds for the TCP connection to one of several masters: a machine that is off answers nothing."""
     open: float = 25.0
     """Seconds for the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
     ping_interval: float | None = 2.0
@@ -275,14 +279,22 @@ class EngineTransport:
             _log.warning("the engine does not read; messages that wait to be sent are lost")
 
     async def _dial(self) -> EngineSocket:
-        target, timing = self._target, self._timing
+        target, timing, masters = self._target, self._timing, self._masters
         tls = target.context()
-        url = self._masters.current
+        url = masters.current
         try:
-            found = await locate(url, target.user, version=target.version, tls=tls, timeout=timing.locate)
+            found = await locate(
+                url,
+                target.user,
+                version=target.version,
+                tls=tls,
+                timeout=min(timing.locate, timing.locate_next) if masters.has_untried else timing.locate,
+                connect=timing.connect if masters.has_others else None,
+            )
         except ClientError:
-            self._masters.failed(url)
+            masters.failed(url)
             raise
+        masters.worked()
         parts = urlsplit(found.url)
         query, headers = target.handshake(header=found.takes_header)
         async with asyncio.timeout(timing.open):

@@ -90,7 +90,8 @@ class TaskSetChannel:
     """The way to the master.
 
     Args:
-        url: Where the master is, ``ws://host:8080`` (or ``wss://``); several are dialed in turn.
+        url: Where the master is, ``ws://host:8080`` (or ``wss://``); of several, the one that took this task
+            set last is dialed first, and the others in turn.
         secret: Proves that this is a task set of the same engine.
         hello: Makes the first message of every connection: the current state of the task set.
         handler: Called with each message of the master but the answers to requests; one after the other, in
@@ -130,6 +131,8 @@ class TaskSetChannel:
         """Why there was no connection, as the log has it."""
         self._handler_failed = False
         self._welcomed = asyncio.Event()
+        self._worked = False
+        """Whether this connection's master took this task set, and did not fall silent."""
 
     @property
     def connected(self) -> bool:
@@ -245,17 +248,20 @@ class TaskSetChannel:
         raise MasterUnavailableError(waited)
 
     async def _connect_once(self) -> float:
-        """Run one connection to its end, and turn to the next master; return how long to wait, in seconds."""
+        """Run one connection to its end, and choose the next master; return how long to wait, in seconds."""
         self._url = self._masters.current
+        self._worked = False
         delay = await self._connect()
-        self._masters.failed(self._url)
+        if not self._worked:
+            self._masters.failed(self._url)
         return delay
 
     async def _connect(self) -> float:
         """Run one connection to its end; return how long to wait before the next, in seconds."""
         shown = self._secret.reveal()
         try:
-            async with asyncio.timeout(self._timeouts.open):
+            timeouts = self._timeouts
+            async with asyncio.timeout(timeouts.connect if self._masters.has_others else timeouts.open):
                 sock = await open_url_socket(self._url)
             async with connect(
                 self._url,
@@ -274,6 +280,8 @@ class TaskSetChannel:
                 try:
                     await self._talk(socket)
                 finally:
+                    if isinstance(socket, TaskSetConnection) and socket.is_silent:  # hung, or cut off
+                        self._worked = False
                     await socket.close()  # a cancelled context manager would report an internal error
         except InvalidStatus as error:
             status = error.response.status_code
@@ -359,6 +367,8 @@ class TaskSetChannel:
                 self._pauses.reset()
                 self._told = ""
                 self._welcomed.set()
+                self._worked = True
+                self._masters.worked()
                 await self._inbox.put(message)
             case Refused():
                 raise _RefusedError(message.reason)

@@ -13,6 +13,9 @@ class ControlTimeouts:
 
     open: float = 5.0
     """A dial, with its handshake, and the first message after it."""
+    connect: float = 2.0
+    """A TCP connection to one of several masters: a machine that is off answers nothing, and another one may
+    lead."""
     ping_interval: float = 5.0
     master_ping_interval: float = 2.0
     """The task set's on the control channel: of several masters, another one leads soon after the leading one

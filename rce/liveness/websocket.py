@@ -32,6 +32,8 @@ class WatchedConnection(Connection):
     _closing: asyncio.TimerHandle | None = None
     """When it is next seen whether the other side takes what waits while it is closed."""
     _has_heard = False
+    is_silent = False
+    """Whether the connection was ended because the other side gave no sign of life."""
 
     @property
     def writable(self) -> bool:
@@ -112,6 +114,7 @@ class WatchedConnection(Connection):
 
     def give_up(self, silent: float) -> None:
         """End the connection, which has been silent for so many seconds."""
+        self.is_silent = True
         self.end_soon()
         if self.protocol.state is State.OPEN:
             self.protocol.fail(CloseCode.INTERNAL_ERROR, f"no sign of life for {silent:.0f} s")

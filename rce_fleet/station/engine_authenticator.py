@@ -41,7 +41,11 @@ _PASSED_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
 T = TypeVar("T")
 _REQUEST_ERRORS = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
 """Raised by requests to the master, also if another program answers at its address."""
+_UNSENT = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError)
+_NO_ANSWER = (aiohttp.ClientConnectionError, TimeoutError)
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
+_TIMEOUT_OF_SEVERAL = aiohttp.ClientTimeout(total=10, sock_connect=2, sock_read=4)
+"""For one of several masters: it may be off or hang, and another one lead."""
 
 
 class RequestOptions(TypedDict):
@@ -101,7 +105,8 @@ class EngineAuthenticator:
     async def __aenter__(self) -> Self:
         """Open the HTTP session; the master may start later."""
         connector = session_connector(None)
-        self._session = aiohttp.ClientSession(timeout=_TIMEOUT, connector=connector)
+        timeout = _TIMEOUT_OF_SEVERAL if self._masters.has_others else _TIMEOUT
+        self._session = aiohttp.ClientSession(timeout=timeout, connector=connector)
         self._writer = asyncio.create_task(self._send_actions())
         return self
 
@@ -129,7 +134,7 @@ class EngineAuthenticator:
         if token in self._cache and now - asked_at < CACHE_S:
             return known
         try:
-            user = await self._in_turn(lambda: self._ask(token))
+            user = await self._in_turn(lambda: self._ask(token), reads=True)
         except _REQUEST_ERRORS as error:
             if token in self._cache and known is not None and now - asked_at < OFFLINE_CACHE_S:
                 return known
@@ -190,19 +195,21 @@ class EngineAuthenticator:
         except asyncio.QueueFull:
             _log.warning("not in the audit log, the queue is full: %s %s", action.name, action.subject)
 
-    async def _in_turn(self, request: Callable[[], Awaitable[T]]) -> T:
-        """Make a request at the master in use, and if there is none, at the others in turn."""
+    async def _in_turn(self, request: Callable[[], Awaitable[T]], *, reads: bool = False) -> T:
+        """Make a request at the master in use, and if it does not get it, at the others in turn.
+
+        Args:
+            request: Makes it.
+            reads: Whether it changes nothing, so that another master may be asked too if no answer comes.
+        """
         for left in range(len(self._masters.all) - 1, -1, -1):
             master = self._masters.current
             try:
                 return await request()
-            except aiohttp.ClientConnectorError:  # nothing was sent
+            except _REQUEST_ERRORS as error:
                 self._masters.failed(master)
-                if not left:
+                if not left or not (isinstance(error, _UNSENT) or (reads and isinstance(error, _NO_ANSWER))):
                     raise
-            except _REQUEST_ERRORS:
-                self._masters.failed(master)
-                raise
         raise AssertionError("there is a master at least")
 
     async def _ask(self, token: str) -> StationUser | None:

@@ -34,6 +34,23 @@ def test_who_fails_late_does_not_skip_an_address() -> None:
     assert masters.current == "b"
 
 
+def test_others_are_untried_until_each_failed() -> None:
+    masters = Masters(["a", "b", "c"])
+    seen = []
+    for _ in range(4):
+        seen.append(masters.has_untried)
+        masters.failed(masters.current)
+        masters.failed("not in use")
+    assert seen == [True, True, False, False]
+    masters.worked()
+    assert masters.has_untried
+    assert masters.current == "b"
+    assert masters.has_others
+    alone = Masters("a")
+    assert not alone.has_untried
+    assert not alone.has_others
+
+
 @pytest.mark.parametrize("nothing", ["", " , ", ()])
 def test_no_address_is_refused(nothing: str | tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="give the address of a master"):

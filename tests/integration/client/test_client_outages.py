@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from integration.client.conftest import TIMING, Engine
+from support.absent_masters import silent_master, unreachable_port
 from support.client_types import ECHO, STRING, ros_string
 from support.cloud import PASSWORD, content_of, running_cloud
 from support.slow_link import SlowLink
@@ -391,6 +393,23 @@ async def test_leaving_can_be_cancelled_while_messages_wait(engine: Engine) -> N
     assert conn.state is State.CLOSED
     with pytest.raises(NotConnectedError):
         await conn.create_container("c1")
+
+
+@pytest.mark.parametrize("fault", ["hangs", "is off"])
+async def test_a_master_that_answers_nothing_is_passed_over_soon(engine: Engine, fault: str) -> None:
+    """Its program hangs, or its machine is off; alone, either would have the time of ``locate``."""
+    timing = replace(TIMING, locate=600.0, locate_next=1.0, connect=1.0)
+    async with contextlib.AsyncExitStack() as stack:
+        if fault == "hangs":
+            absent, _ = await stack.enter_async_context(silent_master())
+        else:
+            absent = f"http://127.0.0.1:{stack.enter_context(unreachable_port())}/"
+        masters = [absent, engine.door.url]
+        async with (
+            asyncio.timeout(60),
+            Connection(masters, "testUser", PASSWORD, "testRobot", timing=timing) as conn,
+        ):
+            assert conn.connected
 
 
 async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import AsyncIterator
 from dataclasses import replace
 
 import pytest
+from support.absent_masters import unreachable_port
 from support.control_ends import QUICK, SECRET, Master, TaskSet, headers, hello
 from support.ports import free_port
 from websockets.asyncio.client import connect
@@ -165,6 +167,72 @@ async def test_of_several_masters_the_next_is_dialed_when_one_is_away() -> None:
             assert second.hellos.empty()
             await stack.aclose()
             await second.hellos.get()
+
+
+@contextlib.asynccontextmanager
+async def counted_standby() -> AsyncIterator[tuple[str, list[int]]]:
+    """Give the address of what closes each connection at once, and the numbers of those that came."""
+    dialed: list[int] = []
+
+    async def close(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        dialed.append(len(dialed))
+        writer.transport.abort()
+
+    server = await asyncio.start_server(close, "127.0.0.1", 0)
+    try:
+        yield f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}", dialed
+    finally:
+        server.close()
+
+
+async def test_the_master_that_worked_is_dialed_first_again() -> None:
+    master = Master()
+    async with counted_standby() as (standby, dialed), master.server:
+        robots = TaskSet(master.server.port)
+        urls = [standby, f"ws://127.0.0.1:{master.server.port}"]
+        robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=QUICK)
+        async with robots.running(), asyncio.timeout(30):
+            for _ in range(3):
+                peer, _ = await master.hellos.get()
+                await robots.channel.wait_connected()
+                assert len(dialed) == 1
+                peer.abort()
+                while robots.channel.connected:
+                    await asyncio.sleep(0.01)
+
+
+async def test_a_master_that_fell_silent_is_dialed_last() -> None:
+    welcomed = 0
+
+    async def fall_silent(socket: ServerConnection) -> None:
+        nonlocal welcomed
+        await socket.recv()
+        await socket.send(encode(Welcome(version=CONTROL_VERSION, master="first")))
+        welcomed += 1
+        socket.transport.pause_reading()
+        await socket.wait_closed()
+
+    timeouts = replace(QUICK, master_ping_interval=0.05, ping_timeout=0.3)
+    second = Master()
+    async with serve(fall_silent, "127.0.0.1", 0, close_timeout=0.1) as first, second.server:
+        robots = TaskSet(second.server.port)
+        urls = [f"ws://127.0.0.1:{port}" for port in (first.sockets[0].getsockname()[1], second.server.port)]
+        robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=timeouts)
+        async with robots.running(), asyncio.timeout(30):
+            await second.hellos.get()
+            assert welcomed == 1
+
+
+async def test_a_master_whose_machine_is_off_is_passed_over_soon() -> None:
+    timeouts = replace(QUICK, open=600.0, connect=0.2)
+    second = Master()
+    async with second.server:
+        with unreachable_port() as port:
+            robots = TaskSet(second.server.port)
+            urls = [f"ws://127.0.0.1:{each}" for each in (port, second.server.port)]
+            robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=timeouts)
+            async with robots.running(), asyncio.timeout(30):
+                await second.hellos.get()
 
 
 async def test_a_master_of_an_older_term_is_not_listened_to(caplog: pytest.LogCaptureFixture) -> None:
