@@ -171,6 +171,11 @@ class TaskModel(OrderFields):
     changed_at: float = Field(description="When the state changed last.")
     started_at: float | None
     expected_end: float | None = Field(description="When it will be done, if that is known.")
+    earliest_end: float | None = Field(
+        default=None,
+        description="Of a task without a robot: when it would be done at about the earliest, if a robot began"
+        " it at its first stop now (or at its earliest start); null: it has a robot, or it is not known.",
+    )
     late: bool = Field(description="Its deadline passed before it was done.")
     occurrence: int = Field(description="Number of this occurrence of a recurring task, from 1.")
     recurs_at: float | None = Field(

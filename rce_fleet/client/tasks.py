@@ -41,7 +41,13 @@ class TaskRequests(ApiRequests):
         return await self._read(f"/tasks/{path_part(task_id)}", TaskModel)
 
     async def tasks(
-        self, *, state: Iterable[str] = (), robot: str = "", requester: str = "", newest_first: bool = False
+        self,
+        *,
+        state: Iterable[str] = (),
+        robot: str = "",
+        requester: str = "",
+        deadline_before: float | None = None,
+        newest_first: bool = False,
     ) -> AsyncIterator[TaskModel]:
         """Yield tasks, page by page.
 
@@ -49,6 +55,7 @@ class TaskRequests(ApiRequests):
             state: States to include, also ``open``, ``ended`` and ``recurring``; empty: all.
             robot: Only tasks that this robot does.
             requester: Only tasks of this user.
+            deadline_before: Only tasks with a deadline before this time, seconds since 1970.
             newest_first: The newest first instead of the oldest.
 
         Example:
@@ -58,6 +65,7 @@ class TaskRequests(ApiRequests):
             ```
         """
         query = {"state": ",".join(state), "robot": robot, "requester": requester, "limit": "500"}
+        query["deadline_before"] = "" if deadline_before is None else repr(deadline_before)
         query["order"] = "desc" if newest_first else "asc"
         while True:
             page = await self._read("/tasks", TaskPage, {key: text for key, text in query.items() if text})

@@ -77,7 +77,7 @@ def changed_order(order: Order, change: TaskChange) -> Order:
     return replace(order, **fields)
 
 
-def show_task(task: Task, expected_end: float | None) -> TaskModel:
+def show_task(task: Task, expected_end: float | None, earliest_end: float | None = None) -> TaskModel:
     """Return a task for the API."""
     order = task.order
     return TaskModel(
@@ -118,6 +118,7 @@ def show_task(task: Task, expected_end: float | None) -> TaskModel:
         changed_at=task.changed_at,
         started_at=task.started_at,
         expected_end=expected_end,
+        earliest_end=earliest_end,
         late=task.late,
         occurrence=task.occurrence,
         recurs_at=task.recurs_at,

@@ -39,7 +39,7 @@ async def create(call: Call) -> FleetAnswer:
 
 async def listed(call: Call) -> FleetAnswer:
     """Return a page of tasks."""
-    call.only("state", "robot", "limit", "cursor", "order", "requester")
+    call.only("state", "robot", "limit", "cursor", "order", "requester", "deadline_before")
     states = {state for state in call.query.get("state", "").split(",") if state}
     unknown = states - {state.value for state in TaskState} - {*_MORE_STATES}
     if unknown:
@@ -53,11 +53,14 @@ async def listed(call: Call) -> FleetAnswer:
     cursor = call.query.get("cursor", "")
     if cursor and not (cursor.isdecimal() and len(cursor) < 19):  # noqa: PLR2004 - digits of a 64-bit number
         raise BadRequestError(f"cursor must be the field next of a page before, not {cursor!r}")
+    before = call.number("deadline_before", None)
     found: list[Task] = []
     for number in sorted(call.manager.book.tasks, reverse=is_descending):
         if cursor and (number >= int(cursor) if is_descending else number <= int(cursor)):
             continue
         task = call.manager.book.tasks[number]
+        if before is not None and (task.order.deadline is None or task.order.deadline >= before):
+            continue
         if _fits(task, states, call.query):
             found.append(task)
             if len(found) > limit:
@@ -164,7 +167,9 @@ def _fits(task: Task, states: set[str], query: dict[str, str]) -> bool:
 
 
 def _show(call: Call, task: Task) -> TaskModel:
-    return show_task(task, call.manager.dispatcher.expected_end(task, call.now))
+    dispatcher = call.manager.dispatcher
+    expected = dispatcher.expected_end(task, call.now)
+    return show_task(task, expected, dispatcher.earliest_end(task, call.now))
 
 
 def _answer(call: Call, task: Task, status: int = 200) -> FleetAnswer:

@@ -1,7 +1,8 @@
 """Sends the view and its changes to the pages.
 
-A page first gets ``map``, ``state`` and ``poses``, which are complete; then ``changes``, numbered from the
-``state`` on, and ``poses`` of robots that moved. A page that misses a number reconnects. A page that asked
+A page first gets ``map``, ``state`` and ``poses``, which are complete, and ``waiting``, the seconds for which
+robots have waited, if some do; then ``changes``, numbered from the ``state`` on, and ``poses`` of robots that
+moved. A page that misses a number reconnects. A page that asked
 for it gets poses as frames (:mod:`rce_fleet.station.pose_frames`).
 """
 
@@ -30,6 +31,7 @@ class Feed:
 
     Attributes:
         pages: The open pages.
+        waiting_since: Since when robots wait, monotonic seconds.
 
     Args:
         view: The state of the fleet.
@@ -44,6 +46,7 @@ class Feed:
         self._sent: dict[str, tuple[_Pose, float]] = {}
         self._all: dict[bool, list[Message]] = {}
         self._indices: dict[str, int] = {}
+        self.waiting_since: dict[str, float] = {}
 
     async def run(self) -> None:
         """Send poses in batches until cancelled."""
@@ -61,6 +64,13 @@ class Feed:
         self._all.clear()
         for robot in change.removed:
             self._sent.pop(robot, None)
+            self.waiting_since.pop(robot, None)
+        now = time.monotonic()
+        for robot in change.robots:
+            if self._view.state_of(robot) == "waiting":
+                self.waiting_since.setdefault(robot, now)
+            else:
+                self.waiting_since.pop(robot, None)
         for robot in change.robots:
             if robot not in self._sent and robot in self._view.poses:
                 self.on_pose(robot)
@@ -140,7 +150,8 @@ class Feed:
     def _tell_all(self, *, compact: bool = False) -> list[Message]:
         """Return the complete messages; made once for all pages that need them now.
 
-        Ages of robots in frames grow while nothing else changes, so a frame is made for each page.
+        Ages of robots in frames grow while nothing else changes, so a frame is made for each page; so does
+        the time that robots have waited.
         """
         grid = self._view.map()
         if grid is None:
@@ -157,7 +168,11 @@ class Feed:
             self._all[compact] = [_text("map", grid), _text("state", state)]
             if not compact:
                 self._all[compact].append(_text("poses", {"poses": self._poses()}))
-        last = [self._frame(self._poses(), time.monotonic())] if compact else []
+        now = time.monotonic()
+        last: list[Message] = [self._frame(self._poses(), now)] if compact else []
+        if self.waiting_since:
+            waited = {robot: round(now - since, 1) for robot, since in self.waiting_since.items()}
+            last.append(_text("waiting", {"seconds": waited}))
         return [*self._all[compact], *last]
 
     def _poses(self) -> dict[str, _Pose]:

@@ -226,6 +226,11 @@ ROUTES: list[Route[str]] = [
             Query(name="state", description="States, separated by commas; also open, ended and recurring."),
             Query(name="robot", description="The robot that does them."),
             Query(name="requester", description="Who created them."),
+            Query(
+                name="deadline_before",
+                description="Only those with a deadline before this time, seconds since 1970.",
+                type="number",
+            ),
             Query(name="order", description="asc (default) or desc."),
             _CURSOR,
             _LIMIT,

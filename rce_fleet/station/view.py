@@ -175,6 +175,10 @@ class FleetView:
         """Return whether the planner knows a robot."""
         return robot in self._robots
 
+    def state_of(self, robot: str) -> str:
+        """Return the state of a robot, such as ``driving``; empty: it is not known."""
+        return str(self._robots.get(robot, {}).get("state", ""))
+
     def mode_of(self, robot: str) -> str:
         """Return the mode that counts for a robot, of its own and the fleet's; empty: not known."""
         return str(self._robots.get(robot, {}).get("mode", ""))

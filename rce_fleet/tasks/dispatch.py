@@ -81,6 +81,8 @@ class Dispatcher:
         self._queues_due = -inf
         self._explained = 0
         self._facts: FleetFacts | None = None
+        self._fastest = self.rules.profile
+        """The profile of the fastest robot."""
         self._measured: set[int] = set()
         """Numbers of open tasks; the distances to their stops were measured."""
         self._measured_epoch = 0
@@ -151,6 +153,8 @@ class Dispatcher:
         self._travel.begin_step()
         self._queues.begin_step()
         self._profiles = zone_profiles(book, facts, self.rules.profile)
+        profiles = map(self.profile, facts.robots)
+        self._fastest = max(profiles, key=lambda profile: profile.speed, default=self.rules.profile)
         if facts.grid is not None:
             self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
         users = self._charger_users(facts)
@@ -233,6 +237,26 @@ class Dispatcher:
         queue.tasks = [each for each in self._book.queue_of(task.robot) if each.number <= task.number]
         left = self._queues.finish(queue)
         return None if left == inf else now + left
+
+    def earliest_end(self, task: Task, now: float) -> float | None:
+        """Return about when a task that waits would be done if a robot began it at its first stop now.
+
+        Args:
+            task: The task. One that must not begin yet is taken to begin at its earliest start.
+            now: Seconds since 1970.
+
+        Returns:
+            Seconds since 1970; None: it has a robot, or the ways between its stops are not known.
+        """
+        if task.state not in (TaskState.QUEUED, TaskState.HELD) or task.robot or not self._travel.has_map:
+            return None
+        profile = self.profile(task.order.robot) if task.order.robot else self._fastest
+        last = min(task.order.length, task.position + len(task.order.stops))
+        cells = [cell for stop in range(task.position, last) for cell in task.order.stop(stop).cells]
+        if self._travel.missing(cells, profile.zone_cost):
+            return None  # measured by a step: a request must not take so long
+        takes = effort_of(task, cells[0] if cells else 0, self._travel, profile).seconds(profile)
+        return None if takes == inf else max(now, task.order.earliest_start or now) + takes
 
     # Parts of a step
 

@@ -1,7 +1,13 @@
-// What an operator can do with a robot by one click, each with its undo where there is one.
+// What an operator can do by one click, each with its undo; where there is none, most ask first.
 
+import { isCertain } from "./question.js";
 import { ask } from "./requests.js";
 import { t } from "./texts.js";
+
+// What a task asks for: its fields that a new one has, too.
+const ORDER = ["stops", "name", "rounds", "priority", "deadline", "when_late", "earliest_start", "capabilities", "payload", "after", "robot", "return_cells", "repeat"];
+
+const REFUSED = [404, 409, 422]; // of one cell: others can be tried
 
 const at = (robot, what) => `/robots/${encodeURIComponent(robot)}/${what}`;
 
@@ -10,6 +16,7 @@ export class Actions {
     this.fleet = fleet;
     this.operator = operator;
     this.work = work; // the manager's tasks and robots
+    this.user = null; // the name of the operator
   }
 
   #do(key, id, run, undo = null) {
@@ -29,7 +36,23 @@ export class Actions {
     return this.sendTo(id, null, goal);
   }
 
-  cancelTask(task) { return this.operator.act(t("action.cancelTask.done", { task }), () => ask("DELETE", `/tasks/${task}`)); }
+  // A task of this operator's that no robot has begun is created again by undo, with another number.
+  async cancelTask(id) {
+    let task;
+    try {
+      task = this.work.find(id) ?? this.work.recurring.find((other) => other.id === id) ?? (await ask("GET", `/tasks/${id}`));
+    } catch (error) {
+      return this.operator.say(error.message, true);
+    }
+    const hasBegun = task.started_at !== null || task.visits.length > 0 || Boolean(task.repeat);
+    const isAwaited = [...this.work.tasks.values()].some(({ after }) => after.includes(id));
+    const canUndo = !hasBegun && !isAwaited && task.requester === this.user;
+    if (!canUndo && !(await isCertain("cancelTask", { task: id }))) return null;
+    const order = Object.fromEntries(ORDER.map((name) => [name, task[name]]));
+    const undo = async () => ({ message: t("action.task.made", { task: (await ask("POST", "/tasks", order)).id }) });
+    return this.operator.act(t("action.cancelTask.done", { task: id }), () => ask("DELETE", `/tasks/${id}`), canUndo ? undo : null);
+  }
+
   holdTask(task) { return this.operator.act(t("action.holdTask.done", { task }), () => ask("POST", `/tasks/${task}/hold`, {}), () => ask("POST", `/tasks/${task}/resume`)); }
   resumeTask(task) { return this.operator.act(t("action.resumeTask.done", { task }), () => ask("POST", `/tasks/${task}/resume`), () => ask("POST", `/tasks/${task}/hold`, {})); }
   raise(task, priority) {
@@ -45,7 +68,14 @@ export class Actions {
   async reassign(id) {
     const task = this.fleet.robots.get(id)?.task;
     if (!task) return this.operator.say(t("action.reassign.none", { robot: id }), true);
+    if (!(await isCertain("reassign", { task, robot: id }))) return null;
     return this.#do("reassign", id, () => ask("POST", `/tasks/${task}/reassign`));
+  }
+
+  // Say where the load of a task is whose robot does not come back; null: it is lost, and the task fails.
+  async settleLoad(task, cell) {
+    if (cell === null && !(await isCertain("loadLost", { task }))) return null;
+    return this.operator.act(t(cell === null ? "action.loadLost.done" : "action.load.done", { task, cell }), () => ask("POST", `/tasks/${task}/load`, { cell }));
   }
 
   confirmTask(task) { return this.operator.act(t("action.confirmTask.done", { task }), () => ask("POST", `/tasks/${task}/confirm`)); }
@@ -69,18 +99,51 @@ export class Actions {
     return this.#do("goal", id, () => ask("PUT", at(id, "goal"), { cell }), () => ask("PUT", at(id, "goal"), { cell: before }));
   }
 
-  setPose(id, x, y, yaw) { return this.#do("localize", id, () => ask("PUT", at(id, "pose"), { x, y, yaw })); }
+  // Undo sets the pose that the robot would have without it, also if it has driven since.
+  setPose(id, x, y, yaw) {
+    const before = this.fleet.robots.get(id)?.pose;
+    const old = before && { ...before };
+    const undo = () => {
+      const now = this.fleet.robots.get(id)?.pose ?? { x, y, theta: yaw };
+      const turn = old.theta - yaw;
+      const [c, s] = [Math.cos(turn), Math.sin(turn)];
+      const [right, up] = [now.x - x, now.y - y];
+      const theta = now.theta + turn;
+      return ask("PUT", at(id, "pose"), { x: old.x + c * right - s * up, y: old.y + s * right + c * up, yaw: Math.atan2(Math.sin(theta), Math.cos(theta)) });
+    };
+    return this.#do("localize", id, () => ask("PUT", at(id, "pose"), { x, y, yaw }), old ? undo : null);
+  }
 
-  // Only the last click counts for undo: many cells at once are one thing. A single cell is always sent, so that a refusal is shown.
+  // Many cells at once are one action, whose undo concerns those that were changed. A single cell is always sent, so that a refusal is shown.
   async setCells(cells, blocked) {
     const changed = cells.length === 1 ? cells : cells.filter((cell) => !this.fleet.walls.has(cell) && (this.fleet.blocked.has(cell) || this.fleet.pending.has(cell)) !== blocked);
     if (!changed.length) return null;
-    const set = async (value) => {
-      let answer = null;
-      for (const cell of changed) answer = await ask("PUT", `/cells/${cell}`, { blocked: value });
-      return changed.length === 1 ? answer : { message: t(value ? "action.block.done" : "action.free.done", { count: changed.length }) };
+    const text = (value, count) => t(value ? "action.block.done" : "action.free.done", { count });
+    const set = async (value, wanted) => {
+      const [done, missed] = [[], []];
+      let [answer, refusal] = [null, null];
+      for (const cell of wanted) {
+        try {
+          answer = await ask("PUT", `/cells/${cell}`, { blocked: value });
+          done.push(cell);
+        } catch (error) {
+          refusal = error;
+          missed.push(cell);
+          if (!REFUSED.includes(error.status)) break;
+        }
+      }
+      if (!done.length) throw refusal;
+      const left = wanted.length - done.length;
+      const message = left ? t("action.cells.part", { label: text(value, done.length), left, cell: missed.at(-1), reason: refusal.message }) : text(value, done.length);
+      return { done, missed, message: wanted.length === 1 ? answer.message : message };
     };
-    return this.operator.act(t(blocked ? "action.block.done" : "action.free.done", { count: changed.length }), () => set(blocked), () => set(!blocked));
+    let done = changed; // until it is known which were changed
+    const run = async () => {
+      const answer = await set(blocked, changed);
+      ({ done } = answer);
+      return answer;
+    };
+    return this.operator.act(text(blocked, changed.length), run, () => set(!blocked, done));
   }
 
   // before: the zone that is replaced; null: it is a new one.
@@ -102,12 +165,17 @@ export class Actions {
     return this.operator.act(t("action.zone.gone", { zone: id }), () => this.#dropZone(id), () => this.#putZone(id, before));
   }
 
-  emergencyStop(id, stopped) {
+  // A stop takes one click; robots that are released drive on.
+  async emergencyStop(id, stopped) {
+    if (!stopped && !(await isCertain(id === null ? "releaseAll" : "release", { robot: id }))) return null;
     return this.operator.act(t(stopped ? "stop.done" : "stop.released"), () => ask("PUT", id === null ? "/emergency-stop" : at(id, "emergency-stop"), { stopped }));
   }
 
-  setMode(mode) {
-    const other = mode === "paused" ? "automatic" : "paused";
-    return this.operator.act(t(`mode.${mode}`), () => ask("PUT", "/mode", { mode }), () => ask("PUT", "/mode", { mode: other }));
+  // A fleet that something else than the page stopped cannot be stopped again by undo.
+  async setMode(mode) {
+    const before = this.fleet.mode;
+    const canUndo = ["automatic", "paused"].includes(before);
+    if (!canUndo && !(await isCertain("mode", { mode: t(`mode.${before}`) }))) return null;
+    return this.operator.act(t(`mode.${mode}`), () => ask("PUT", "/mode", { mode }), canUndo ? () => ask("PUT", "/mode", { mode: before }) : null);
   }
 }

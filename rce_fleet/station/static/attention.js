@@ -1,6 +1,6 @@
 // What needs the operator, worst first, each with the answers that fit.
 
-import { exceptionsOf, fleetConditionsOf, isPossible, rowsOf } from "./conditions.js";
+import { exceptionsOf, fleetConditionsOf, isPossible, loadCells, rowsOf, taskConditionsOf } from "./conditions.js";
 import { element } from "./engine.js";
 import { t } from "./texts.js";
 
@@ -22,34 +22,44 @@ export class Attention {
   #drawn = "";
   #open = new Set(); // kinds of groups whose robots are shown
 
-  // answer: (name, robot) => does it
-  constructor(fleet, answer) {
+  // answer: (name, robot) => does it; answerTask: (name, task, cell)
+  constructor(fleet, work, answer, answerTask) {
     this.fleet = fleet;
+    this.work = work;
     this.answer = answer;
+    this.answerTask = answerTask;
     this.steers = true;
     this.list = document.querySelector("#attention-list");
     this.count = document.querySelector("#attention-count");
     setInterval(() => this.draw(), DRAW_EVERY_MS);
     for (const type of ["control", "planner"]) fleet.addEventListener(type, () => this.draw());
+    work.addEventListener("change", () => this.draw());
   }
 
   draw() {
     const whole = fleetConditionsOf(this.fleet);
     const found = exceptionsOf([...this.fleet.robots.values(), ...this.fleet.unknownUndelivered()]);
-    this.count.textContent = whole.length + found.length || "";
-    const rows = rowsOf(found, this.fleet.stoppedBy !== null);
+    const tasks = taskConditionsOf(this.work);
+    this.count.textContent = whole.length + found.length + tasks.length || "";
+    const rows = [...rowsOf(found, this.fleet.stoppedBy !== null), ...tasks].sort((a, b) => b.conditions[0].severity - a.conditions[0].severity);
     const shown = rows.slice(0, MOST);
-    const hidden = rows.slice(MOST).reduce((count, { robots }) => count + robots.length, 0);
+    const hidden = rows.slice(MOST).reduce((count, { robots }) => count + (robots?.length ?? 1), 0);
     // Rebuilt only when something else is to be shown, so that a button keeps its focus.
-    const key = JSON.stringify([this.steers, this.fleet.manager, whole, hidden, shown.map(({ robots, conditions }) => [robots.map(({ id }) => id), conditions.map(({ kind }) => kind)])]);
+    const parts = shown.map(({ robots, task, conditions }) => [task ? [task.id, loadCells(task, this.fleet.robots)] : robots.map(({ id }) => id), conditions.map(({ kind }) => kind)]);
+    const key = JSON.stringify([this.steers, this.fleet.manager, whole, hidden, parts]);
     if (key === this.#drawn) {
       shown.forEach(({ conditions }, index) => { this.list.children[whole.length + index].querySelector(".why").textContent = conditions.map(({ text }) => text).join("; "); });
       return;
     }
     this.#drawn = key;
-    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((row) => (row.robots.length > 1 ? this.#group(row) : this.#item(row))));
+    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((row) => this.#row(row)));
     if (hidden) this.list.append(element("li", t("attention.more", { count: hidden }), "quiet"));
-    if (!whole.length && !found.length) this.list.append(element("li", t("attention.none"), "quiet"));
+    if (!rows.length && !whole.length) this.list.append(element("li", t("attention.none"), "quiet"));
+  }
+
+  #row(row) {
+    if (row.task) return this.#taskItem(row);
+    return row.robots.length > 1 ? this.#group(row) : this.#item(row);
   }
 
   #line(content, isSevere = true) {
@@ -115,6 +125,27 @@ export class Attention {
       }
       item.append(row);
     }
+    return item;
+  }
+
+  // A task that no robot goes on with, with the answers that fit.
+  #taskItem({ task, conditions: [{ kind, severity, text }] }) {
+    const item = this.#line([element("b", task.id), " ", element("span", text, "why")], severity > 2);
+    if (!this.steers) return item;
+    const row = element("div", "", "answers");
+    const add = (answer, label, cell = null) => {
+      const button = element("button", label);
+      button.type = "button";
+      button.setAttribute("aria-label", `${label}: ${task.id}`);
+      button.addEventListener("click", () => this.answerTask(answer, task.id, cell));
+      row.append(button);
+    };
+    if (kind === "load") {
+      for (const [cell, where] of loadCells(task, this.fleet.robots)) add("loadAt", t(`action.load.${where}`, { cell, robot: task.robot_assigned }), cell);
+      if (task.rounds === 1) add("loadPlace", t("action.loadPlace"));
+      add("loadLost", t("action.loadLost"));
+    } else for (const answer of ["raise", "cancel"]) add(answer, t(`action.${answer}`));
+    item.append(row);
     return item;
   }
 }

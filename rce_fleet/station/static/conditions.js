@@ -60,6 +60,35 @@ export function conditionsOf(robot, now = performance.now()) {
   return found.sort((a, b) => b.severity - a.severity);
 }
 
+// All that is wrong with tasks that no robot does, or whose load is on a robot that does not come back:
+// {task, conditions}, as with a robot.
+export function taskConditionsOf({ questions, atRisk }) {
+  const one = (task, kind, severity, text) => ({ task, conditions: [{ kind, severity, text }] });
+  return [
+    ...questions.map((task) => one(task, "load", 3, task.question)),
+    ...atRisk.map((task) => one(task, "lateTask", 2, t(task.late ? "condition.lateTask" : "condition.taskAtRisk", { time: clock(task.deadline) }))),
+  ];
+}
+
+// Time of day.
+export function clock(seconds) {
+  return new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false });
+}
+
+// Whether a task that has not ended will probably miss its deadline.
+export function isAtRisk({ deadline, late, expected_end: expected, earliest_end: earliest }, now = Date.now() / 1000) {
+  return Boolean(deadline) && (late || (expected ?? earliest ?? now) > deadline);
+}
+
+// The cells where the load of a task may be: where its robot is, and where it was taken. A task with rounds may have several loads.
+export function loadCells({ visits, stops, rounds, robot_assigned: id }, robots) {
+  if (rounds > 1) return [];
+  const picked = visits.filter(({ stop }) => stop >= 0 && stops[stop].action === "pick").at(-1)?.cell ?? null;
+  const here = robots.get(id)?.cell ?? null;
+  const cells = [[here, "withRobot"], [picked, "taken"]].filter(([cell]) => cell !== null);
+  return here === picked ? cells.slice(0, 1) : cells;
+}
+
 // All that is wrong with the whole fleet: as with a robot.
 export function fleetConditionsOf({ plannerAwaySince }) {
   if (plannerAwaySince === null) return [];

@@ -2,6 +2,7 @@
 
 import { Actions } from "./actions.js";
 import { Attention } from "./attention.js";
+import { describeCell } from "./cell_text.js";
 import { Connection } from "./connection.js";
 import { Drive } from "./drive.js";
 import { Gestures } from "./gestures.js";
@@ -60,7 +61,7 @@ const actions = new Actions(fleet, operator, work);
 const tools = new Tools(view, fleet, actions);
 const drive = new Drive(fleet);
 const gestures = new Gestures(view.canvas, view.camera, tools);
-new RobotsTable(fleet);
+new RobotsTable(fleet, (robot) => answer("show", robot));
 new LayerPanel(fleet, layers, view);
 new Figures();
 const world = new World3d(at("#world"), view.scene, fleet);
@@ -71,8 +72,18 @@ tools.isPast = () => replay.at !== null;
 new ZoneForm(tools, actions, work);
 const tasks = new TasksPanel(work, actions, fleet);
 
-function releaseAll() {
-  if (confirm(t("stop.confirm"))) actions.emergencyStop(null, false);
+const releaseAll = () => actions.emergencyStop(null, false);
+
+// An answer to a task's exception.
+function answerTask(name, task, cell) {
+  const answers = {
+    raise: () => actions.raise(task, 100),
+    cancel: () => actions.cancelTask(task),
+    loadAt: () => actions.settleLoad(task, cell),
+    loadPlace: () => tools.chooseLoad(task),
+    loadLost: () => actions.settleLoad(task, null),
+  };
+  return answers[name]();
 }
 
 // An answer to an exception, or a button of a robot's card.
@@ -99,7 +110,7 @@ function answer(name, robot) {
   return (answers[name] ?? (() => actions[name](robot)))();
 }
 
-const attention = new Attention(fleet, answer);
+const attention = new Attention(fleet, work, answer, answerTask);
 const card = new RobotCard(fleet, answer);
 
 view.canvas.addEventListener("keydown", (event) => {
@@ -110,6 +121,7 @@ view.canvas.addEventListener("keydown", (event) => {
   if (event.key in steps) {
     const next = (view.cursor ?? 0) + steps[event.key];
     if (next >= 0 && next < rows * columns) view.cursorCell = next;
+    if (view.cursor !== null) at("#cursor-text").textContent = describeCell(fleet, work.zones, view.cursor);
   } else if (event.key === "Enter" && view.cursor !== null) tools.use(view.cursor);
   else if (event.key === "Escape") tools.choose("act");
   else return;
@@ -163,7 +175,7 @@ work.addEventListener("change", () => {
   view.touch("cells");
 });
 document.addEventListener("keydown", (event) => {
-  if ((event.ctrlKey || event.metaKey) && event.key === "z" && !event.target.closest("input")) operator.undo();
+  if ((event.ctrlKey || event.metaKey) && event.key === "z" && !event.target.closest("input, dialog")) operator.undo();
 });
 
 const editor = new GridEditor(fleet, ask);
@@ -197,6 +209,7 @@ async function identify() {
     if (connection.isLive) setTimeout(() => { if (number === identified) identify(); }, IDENTIFY_AGAIN_MS);
     return;
   }
+  actions.user = person.name;
   at("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
   at("#logout").hidden = !person.logged_in;
   editor.form.hidden = !person.steers;

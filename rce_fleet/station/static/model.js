@@ -82,7 +82,7 @@ export class Fleet extends EventTarget {
   #take(state) {
     const robot = this.#robot(state.id);
     if (state.state !== "waiting") robot.waitingSince = null;
-    else if (robot.state !== "waiting") robot.waitingSince = performance.now();
+    else if (robot.state !== "waiting") robot.waitingSince = performance.now(); // on_waiting corrects those that waited before
     Object.assign(robot, state);
     if (state.index !== undefined) this.#byIndex[state.index] = robot;
   }
@@ -128,6 +128,15 @@ export class Fleet extends EventTarget {
     robot.shown ??= { x, y, theta };
     robot.seen = now;
     robot.trail.add(x, y);
+  }
+
+  // For how many seconds robots have waited, also before this page was opened.
+  on_waiting({ seconds }) {
+    const now = performance.now();
+    for (const [id, waited] of Object.entries(seconds)) {
+      const robot = this.robots.get(id);
+      if (robot?.state === "waiting") robot.waitingSince = now - 1000 * waited;
+    }
   }
 
   // Who stopped robots, and who drives them by hand: {robot: user}.

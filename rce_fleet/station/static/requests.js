@@ -54,7 +54,7 @@ export class Operator extends EventTarget {
     try {
       const answer = await run();
       const text = answer?.message || t("done", { label });
-      // An emergency stop that has not reached every robot stays in the list of events.
+      // What was not done for every robot or cell stays in the list of events, as an emergency stop.
       const isPartial = Boolean(answer?.missed?.length);
       this.say(text, isPartial);
       if (isPartial) this.note(text);
@@ -67,9 +67,12 @@ export class Operator extends EventTarget {
     }
   }
 
+  // Take back the last action. If that is refused, it can be tried again.
   async undo() {
     const last = this.#done.pop();
     if (!last || (await last.running) === null) return;
-    await this.act(t("undo.done", { label: last.label }), last.undo);
+    if ((await this.act(t("undo.done", { label: last.label }), last.undo)) !== null) return;
+    this.#done.push(last);
+    this.dispatchEvent(new Event("acted"));
   }
 }

@@ -40,7 +40,7 @@ export class RobotCard {
       this.box.replaceChildren(this.title, this.text, row);
     }
     const age = heartbeatAge(robot);
-    const parts = [robot.undelivered && t("condition.undelivered", { user: robot.emergency }), robot.activity ?? robot.state, robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];
+    const parts = [robot.undelivered && t("condition.undelivered", { user: robot.emergency }), robot.activity ?? robot.state, robot.pose_only && t("robot.poseOnly"), robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];
     parts.push(age === null ? t("age.never") : t("age.seconds", { seconds: age.toFixed(1) }));
     this.text.textContent = parts.filter(Boolean).join(" \u00b7 ");
   }

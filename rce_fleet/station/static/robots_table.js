@@ -20,7 +20,8 @@ export class RobotsTable {
   #above = spacer();
   #below = spacer();
 
-  constructor(fleet) {
+  // show: (robot) => selects it and moves the map there
+  constructor(fleet, show) {
     this.fleet = fleet;
     this.box = document.querySelector("#robots-box");
     this.body = document.querySelector("#robots tbody");
@@ -34,11 +35,16 @@ export class RobotsTable {
       const row = event.target.closest("tr[data-robot]");
       if (row) fleet.select(row.dataset.robot);
     });
+    this.body.addEventListener("dblclick", (event) => {
+      const row = event.target.closest("tr[data-robot]");
+      if (row) show(row.dataset.robot);
+    });
     this.body.addEventListener("keydown", (event) => {
       const row = event.target.closest("tr[data-robot]");
       if (!row || (event.key !== "Enter" && event.key !== " ")) return;
       event.preventDefault();
-      fleet.select(row.dataset.robot);
+      if (event.key === "Enter") show(row.dataset.robot);
+      else fleet.select(row.dataset.robot);
     });
     setInterval(() => this.draw(), 1000);
   }
@@ -120,6 +126,7 @@ class Row {
     if (row.ariaSelected !== String(selected)) row.setAttribute("aria-selected", selected);
     const age = heartbeatAge(robot);
     const [, state, cell, goal, replans, seen] = cells;
+    if (state.title !== (robot.pose_only ? t("robot.poseOnly") : "")) state.title = robot.pose_only ? t("robot.poseOnly") : "";
     setText(state, stateText(robot), robot.emergency || TROUBLE.has(robot.state) ? "bad" : "");
     setText(cell, robot.cell ?? "");
     setText(goal, robot.goal ?? "");
@@ -129,9 +136,10 @@ class Row {
 }
 
 // A robot that has not got its stop may be driving: its own state stays visible.
-function stateText({ emergency, undelivered, state }) {
+function stateText({ emergency, undelivered, state, pose_only: isByPose }) {
   if (undelivered) return t("state.undelivered", { state });
-  return emergency ? t("state.emergency") : state;
+  if (emergency) return t("state.emergency");
+  return isByPose ? t("state.poseOnly", { state }) : state;
 }
 
 function setText(part, text, name = "") {

@@ -1,5 +1,6 @@
 // The list of tasks with their expected ends, and the form for a new one.
 
+import { clock, isAtRisk } from "./conditions.js";
 import { element } from "./engine.js";
 import { t } from "./texts.js";
 import { ENDED } from "./work.js";
@@ -12,10 +13,6 @@ const MOST_OPEN = 100;
 function awaitsConfirmation({ visits, stops }) {
   const last = visits.at(-1);
   return last?.ended_at === null && last.stop >= 0 && stops[last.stop % stops.length].confirm;
-}
-
-function clock(seconds) {
-  return new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false });
 }
 
 export class TasksPanel {
@@ -67,8 +64,8 @@ export class TasksPanel {
     const ended = ENDED.includes(task.state);
     if (ended && task.recurs_at) return element("td", t("tasks.next", { time: clock(task.recurs_at) }), "quiet");
     const at = ended ? task.changed_at : task.expected_end;
-    const risk = !ended && task.deadline && (task.late || (at ?? 0) > task.deadline);
-    const text = at ? clock(at) : "";
+    const risk = !ended && isAtRisk(task);
+    const text = at ? clock(at) : !ended && task.earliest_end ? t("tasks.earliest", { time: clock(task.earliest_end) }) : "";
     return element("td", risk ? `\u26a0 ${text}` : text, risk ? "bad" : "quiet");
   }
 

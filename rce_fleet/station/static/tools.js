@@ -2,12 +2,13 @@
 
 import { t } from "./texts.js";
 
-// Tools: act (click: a robot, its goal, or a cell to block), block, free, zone, pose, task.
+// Tools: act (click: a robot, its goal, or a cell to block), block, free, zone, pose, task; load (no button of its own).
 export class Tools extends EventTarget {
   tool = "act";
   steers = true;
   isPast = () => false; // whether the map shows a past moment, or loads it: nothing is sent to the fleet of now
   #drag = null;   // {from: [x, y], to: [x, y], robot}
+  #loadOf = null; // the task of the tool load
   #pick = null;   // first cell of a task, or where a robot is that is localized without a drag
 
   constructor(view, fleet, actions) {
@@ -25,6 +26,12 @@ export class Tools extends EventTarget {
     this.dispatchEvent(new Event("chosen"));
   }
 
+  // The next click says where the load of a task is.
+  chooseLoad(task) {
+    this.#loadOf = task;
+    this.choose("load");
+  }
+
   // What the operator should do next.
   get hint() {
     const robot = this.fleet.selected;
@@ -34,7 +41,7 @@ export class Tools extends EventTarget {
     if (this.tool === "pose" && !robot) return t("hint.poseRobot");
     if (this.tool === "pose" && this.#pick !== null) return t("hint.look", { robot });
     if (this.tool === "task" && this.#pick !== null) return t("hint.drop", { cell: this.#pick });
-    return t(`hint.${this.tool}`, { robot });
+    return t(`hint.${this.tool}`, { robot, task: this.#loadOf });
   }
 
   // Tell that the map shows a past moment, if it does.
@@ -54,7 +61,7 @@ export class Tools extends EventTarget {
     if (!this.fleet.map || !this.steers || this.isPast()) return false;
     const at = this.view.worldAt(event);
     const robot = this.#robotAt(...at);
-    const takes = { act: robot !== null, block: true, free: true, zone: true, pose: this.fleet.selected !== null, task: false };
+    const takes = { act: robot !== null, block: true, free: true, zone: true, pose: this.fleet.selected !== null, task: false, load: false };
     if (!takes[this.tool]) return false;
     this.#drag = { from: at, to: at, robot: robot?.id ?? null };
     return true;
@@ -110,6 +117,7 @@ export class Tools extends EventTarget {
     else if (this.tool === "block" || this.tool === "free") actions.setCells([cell], this.tool === "block");
     else if (this.tool === "zone") this.dispatchEvent(new CustomEvent("zone", { detail: [cell] }));
     else if (this.tool === "task") this.#pickOrDrop(cell);
+    else if (this.tool === "load") this.#placeLoad(cell);
     else if (this.tool === "pose" && fleet.selected) this.#placeOrTurn(cell);
   }
 
@@ -123,6 +131,10 @@ export class Tools extends EventTarget {
     }
     this.view.touch("overlay");
     this.dispatchEvent(new Event("chosen"));
+  }
+
+  async #placeLoad(cell) {
+    if ((await this.actions.settleLoad(this.#loadOf, cell)) !== null) this.choose("act");
   }
 
   async #pickOrDrop(cell) {

@@ -1,5 +1,6 @@
 // The manager's tasks, robots, zones and figures, asked for every few seconds; independent of the screen.
 
+import { isAtRisk } from "./conditions.js";
 import { ask } from "./requests.js";
 
 const EVERY_MS = 2000;
@@ -9,6 +10,9 @@ const ROBOTS_TASKS = "running,suspended,cancelling,held,assigned";
 const PAGE = 1000;
 const MOST_PAGES = 5;
 
+// Tasks without a robot are watched if their deadline comes within this time, seconds.
+const WATCHED_S = 3600;
+
 export const ENDED = ["done", "failed", "cancelled"];
 
 export class Work extends EventTarget {
@@ -16,6 +20,8 @@ export class Work extends EventTarget {
   openCount = 0;       // how many have not ended
   recent = [];         // other tasks that ended, the newest first
   recurring = [];      // tasks that ended, and of which another occurrence follows
+  questions = [];      // tasks of which people have to decide where their load is
+  atRisk = [];         // tasks that no robot does, and that will probably miss their deadlines
   zones = [];
   chargers = null;
   statistics = null;
@@ -50,6 +56,8 @@ export class Work extends EventTarget {
     this.openCount = 0;
     this.recent = [];
     this.recurring = [];
+    this.questions = [];
+    this.atRisk = [];
     this.statistics = null;
     for (const robot of this.fleet.robots.values()) Object.assign(robot, { task: null, activity: null, queue: [], loads: 0, deadlineAtRisk: null });
     this.dispatchEvent(new Event("change"));
@@ -57,11 +65,14 @@ export class Work extends EventTarget {
 
   async #ask() {
     try {
-      const [robots, open, ended, recurring, zones, statistics] = await Promise.all([
+      const soon = Math.round(Date.now() / 1000) + WATCHED_S;
+      const [robots, open, ended, recurring, due, waiting, zones, statistics] = await Promise.all([
         ask("GET", "/robots"),
         ask("GET", `/tasks?state=open&limit=${MOST_TASKS}`),
         ask("GET", "/tasks?state=ended&order=desc&limit=20"),
         ask("GET", `/tasks?state=recurring&limit=${MOST_TASKS}`),
+        ask("GET", `/tasks?state=queued,assigned,held&deadline_before=${soon}&limit=${MOST_TASKS}`),
+        ask("GET", `/tasks?state=suspended,cancelling&limit=${PAGE}`),
         ask("GET", "/zones"),
         ask("GET", "/statistics?seconds=3600"),
       ]);
@@ -73,6 +84,9 @@ export class Work extends EventTarget {
       this.openCount = open.next === null ? tasks.size : Math.max(tasks.size + 1, statistics.tasks_open);
       this.recurring = recurring.tasks.filter(({ state }) => ENDED.includes(state));
       this.recent = ended.tasks.filter(({ recurs_at: next }) => !next);
+      this.questions = waiting.tasks.filter(({ question }) => question);
+      const done = new Set(robots.robots.map(({ task }) => task));
+      this.atRisk = due.tasks.filter((task) => isAtRisk(task) && !done.has(task.id));
       this.zones = zones.zones;
       this.statistics = statistics;
       this.#takeRobots(robots.robots);
@@ -98,12 +112,11 @@ export class Work extends EventTarget {
 
   // What the manager knows of robots beside the planner: batteries, tasks, activities.
   #takeRobots(robots) {
-    const now = Date.now() / 1000;
     for (const { id, battery, task, activity, queue, loads } of robots) {
       const robot = this.fleet.robots.get(id);
       if (!robot) continue;
       const doing = this.find(task);
-      const late = doing?.deadline && ((doing.expected_end ?? now) > doing.deadline || doing.late);
+      const late = doing && isAtRisk(doing);
       Object.assign(robot, { battery, task, activity, queue, loads: loads?.length ?? 0, deadlineAtRisk: late ? task : null });
     }
   }

@@ -49,12 +49,18 @@ async def check_stops(made: Site, page: Page) -> None:
     await page.locator("#robot-card button", has_text="Stop").click()
     await made.until(lambda: made.stops and made.stops[-1])
     await page.locator("#attention-list button", has_text="Release").click()
+    await page.keyboard.press("Escape")  # the question is answered by no
+    await page.locator("#question").wait_for(state="hidden")
+    assert made.stops[-1]
+    await page.locator("#attention-list button", has_text="Release").click()
+    await page.keyboard.press("Tab")
+    await page.keyboard.press("Enter")
     await made.until(lambda: not made.stops[-1])
     await page.locator("#stop-all").click()
     await made.until(lambda: made.stops[-1])
     await page.locator("#release-all").wait_for()
-    page.once("dialog", lambda dialog: dialog.accept())
     await page.locator("#release-all").click()
+    await page.locator("#question-yes").click()
     await made.until(lambda: not made.stops[-1])
     await page.locator("#release-all").wait_for(state="hidden")
 
@@ -73,8 +79,8 @@ async def check_missed(page: Page) -> None:
     await page.locator("tr[data-robot=Robot2]").click()
     for name in ("Stop", "Release"):
         await page.locator("#robot-card button", has_text=name).wait_for()
-    page.once("dialog", lambda dialog: dialog.accept())
     await page.locator("#release-all").click()
+    await page.locator("#question-yes").click()
     await page.locator("tr[data-robot=Robot2]", has_text="stop not delivered").wait_for(state="detached")
 
 
@@ -138,8 +144,8 @@ async def test_a_stop_of_all_robots_is_one_row() -> None:
         await group.locator("summary").click()
         await group.locator("button", has_text="Robot12").click()
         await page.locator("#robot-card", has_text="Robot12").wait_for()
-        page.once("dialog", lambda dialog: dialog.accept())
         await group.locator("button", has_text="Release all").click()
+        await page.locator("#question-yes").click()
         await made.until(lambda: made.stops and not made.stops[-1])
         await group.wait_for(state="detached")
 

@@ -81,17 +81,20 @@ async def check_buttons(page: Page, fleet: ManagedFleet) -> None:
     await fleet.ask("POST", f"/robots/{robot}/pause")
     if await fleet.until_standing(robot) != 27:  # a robot that has arrived keeps the task
         await page.wait_for_function("id => rceFleet.fleet.robots.get(id).task", arg=robot)
-        await page.evaluate("id => rceFleet.actions.reassign(id)", robot)
+        await page.evaluate("id => void rceFleet.actions.reassign(id)", robot)
+        await page.locator("#question-yes").click()
     await fleet.ask("POST", f"/robots/{robot}/resume")
     await page.locator(f"#task-{task}-confirm").click()
     await fleet.until_state(task, "done")
     later = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "earliest_start": 4e9})).body["id"]
     await page.locator(f"#task-{later}-cancel").click()
+    await page.locator("#question-yes").click()  # it is another user's: undo could not bring it back
     await fleet.until_state(later, "cancelled")
     order = {"stops": [{"cell": 5}], "repeat": {"every": 86400}}
     daily = (await fleet.ask("POST", "/tasks", order)).body["id"]
     await page.wait_for_function("rceFleet.work.recurring.length === 1")  # done, between two occurrences
     await page.locator(f"#task-{daily}-cancel").click()
+    await page.locator("#question-yes").click()
     await page.wait_for_function("rceFleet.work.recurring.length === 0")
     assert (await fleet.ask("GET", "/tasks?state=recurring")).body["tasks"] == []
 

@@ -6,7 +6,7 @@ import asyncio
 import json
 import shutil
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -84,7 +84,7 @@ class Site:
 
 
 @asynccontextmanager
-async def site() -> AsyncIterator[Site]:
+async def site(make_planner: Callable[[FleetView, Feed], Planner] = Planner) -> AsyncIterator[Site]:
     from playwright.async_api import async_playwright
 
     view = FleetView()
@@ -93,8 +93,10 @@ async def site() -> AsyncIterator[Site]:
     view.on_pose("Robot1", pose(1.5, 1.5, 0.0))
     view.on_pose("Robot2", pose(6.5, 6.5, 0.0))
     recorder = Recorder(view, Records())
-    planner = Planner(view, feed)
+    planner = make_planner(view, feed)
     station = Station(view, planner, feed.pages, records=recorder.records)
+    if planner.can_ask_manager:
+        await station.fleet_api.manager.look()
     async with TestServer(station.make_app()) as server, async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
         made = Site(str(server.make_url("/")), browser, view, feed, recorder, planner.modes)

@@ -40,6 +40,19 @@ def test_priority_age_and_deadline_come_first(floor: Floor) -> None:
     assert other.task(due).state is TaskState.RUNNING
 
 
+def test_a_waiting_task_says_when_it_could_be_done(floor: Floor) -> None:
+    """As if a robot began it at its first stop now, or at its earliest start."""
+    floor.add("Robot1", 0)
+    doing = floor.go(63)
+    waits = floor.deliver(8, 12, robot="Robot2")
+    later = floor.go(5, robot="Robot2", earliest_start=floor.now + 500)
+    floor.dispatcher.measure(floor.facts)
+    floor.run(1)
+    ends = [floor.dispatcher.earliest_end(floor.task(task), floor.now) for task in (doing, waits, later)]
+    speed = floor.dispatcher.profile("Robot2").speed
+    assert ends == [None, pytest.approx(floor.now + 4 / speed + 4), pytest.approx(floor.now - 1 + 500)]
+
+
 @pytest.mark.parametrize("deadline", [-1e308, 1e308])
 def test_extreme_deadlines_leave_costs_finite(floor: Floor, deadline: float) -> None:
     floor.add("Robot1", 0)

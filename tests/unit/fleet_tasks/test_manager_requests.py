@@ -28,6 +28,10 @@ async def test_pages_of_tasks_follow_each_other(client: ManagerClient) -> None:
     assert [task["id"] for task in first["tasks"] + second["tasks"]] == ["T1", "T2", "T3", "T4"]
     assert newest["tasks"][0]["id"] == "T5"
     await client.ask("DELETE", "/tasks/T3")
+    await client.ask("PATCH", "/tasks/T2", {"deadline": 5e9})
+    due = (await client.ask("GET", "/tasks?deadline_before=5000000001"))[1]
+    assert [task["id"] for task in due["tasks"]] == ["T2"]
+    assert (await client.ask("GET", "/tasks?deadline_before=5000000000"))[1]["tasks"] == []
     ended = (await client.ask("GET", "/tasks?state=ended"))[1]
     assert ([task["id"] for task in ended["tasks"]], ended["next"]) == (["T3"], None)
 

@@ -1,0 +1,229 @@
+"""The page with a fleet manager in the same program: tasks that need attention, undo, questions."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from integration.station.test_page_operator import Planner, Site, site
+from support.fleet_manager import ManagerClient
+from unit.station.test_station_view import changes, robot
+
+from rce_fleet.tasks.facts import RobotFacts
+from rce_fleet.tasks.task import StopVisit, TaskState
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    from playwright.async_api import Page
+
+    from rce_fleet.station.feed import Feed
+    from rce_fleet.station.view import FleetView
+
+pytestmark = pytest.mark.needs("chromium")
+
+DELIVERY = {"stops": [{"action": "pick", "cell": 18}, {"action": "deliver", "cell": 21}]}
+
+
+class ManagedPlanner(Planner):
+    """A planner with a manager behind it."""
+
+    can_ask_manager = expects_manager = True
+    client: ManagerClient
+
+    def forget_requests(self) -> None:
+        """Keep none: there is no wire to a planner."""
+
+    def forget_cell(self, cell: int) -> None:
+        del cell
+
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        given = {**request, "body": request["body"] or None}
+        method, path = given.pop("method"), given.pop("path")
+        status, body, revision = await self.client.ask(method, path, **given)
+        return {"status": status, "body": json.dumps(body), "revision": revision}
+
+
+@asynccontextmanager
+async def managed(tmp_path: Path) -> AsyncIterator[tuple[Site, ManagerClient, Page]]:
+    """A page that shows what the manager says."""
+    client = ManagerClient(tmp_path / "journal.sqlite")
+
+    def make(view: FleetView, feed: Feed) -> Planner:
+        planner = ManagedPlanner(view, feed)
+        planner.client = client
+        return planner
+
+    try:
+        async with site(make) as made:
+            page = await made.open()
+            await page.wait_for_function("rceFleet.work.trouble === null")
+            yield made, client, page
+    finally:
+        await client.manager.close()
+
+
+def strand(client: ManagerClient, task_id: str) -> None:
+    """Suspend a task whose robot has its load, and does not come back."""
+    task = client.manager.book.find(task_id)
+    visit = StopVisit(0, "Robot1", 18, 1.0, 2.0)
+    client.manager.book.put_record(
+        replace(task, state=TaskState.SUSPENDED, robot="Robot1", loads=1, position=1, visits=(visit,))
+    )
+
+
+async def until_state(page: Page, task: str, state: str) -> None:
+    """Wait until the page knows a task in a state."""
+    known = "[...rceFleet.work.tasks.values(), ...rceFleet.work.recent]"
+    await page.wait_for_function(
+        f"([task, state]) => {known}.some((one) => one.id === task && one.state === state)", arg=[task, state]
+    )
+
+
+async def test_a_question_about_a_load_is_answered_by_a_click(tmp_path: Path) -> None:
+    """Where the robot stands, where the load was taken, any cell, or nowhere."""
+    async with managed(tmp_path) as (made, client, page):
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot1", state="silent", cell=10))))
+        tasks = [(await client.ask("POST", "/tasks", DELIVERY))[1]["id"] for _ in range(3)]
+        for number, answer in enumerate(["At cell 10, with Robot1", "At cell 18, where it was taken"]):
+            strand(client, tasks[number])
+            item = page.locator("#attention-list li.severe", has_text="Where is the load that Robot1 has?")
+            await item.locator("button", has_text=answer).click()
+            await until_state(page, tasks[number], "queued")
+            await item.wait_for(state="detached")
+            stops = client.manager.book.find(tasks[number]).order.stops
+            assert [stop.cells[0] for stop in stops][-2:] == [[10, 18][number], 21]
+        strand(client, tasks[2])
+        await page.locator("#attention-list button", has_text="It is lost").click()
+        await page.locator("#question-no").click()
+        await page.locator("#attention-list button", has_text="Choose its cell").click()
+        await page.locator("#hint", has_text=f"where the load of task {tasks[2]} is").wait_for()
+        await page.evaluate("rceFleet.tools.use(33)")
+        await until_state(page, tasks[2], "queued")
+        assert client.manager.book.find(tasks[2]).order.stops[-2].cells == (33,)
+        strand(client, tasks[2])
+        await page.locator("#attention-list button", has_text="It is lost").click()
+        await page.locator("#question-yes").click()
+        await until_state(page, tasks[2], "failed")
+
+
+async def test_a_late_task_that_no_robot_has_needs_attention(tmp_path: Path) -> None:
+    """Also before its deadline, if that comes before the task could be done."""
+    async with managed(tmp_path) as (_, client, page):
+        now = time.time()
+        late = (await client.ask("POST", "/tasks", {**DELIVERY, "deadline": now + 5}))[1]["id"]
+        slow = {"stops": [{"cell": 3, "duration": 600}], "deadline": now + 500}
+        near = (await client.ask("POST", "/tasks", slow))[1]["id"]
+        far = (await client.ask("POST", "/tasks", {**slow, "deadline": now + 3000}))[1]["id"]
+        client.manager.facts.robots["Robot1"] = RobotFacts("Robot1")
+        client.manager.dispatcher.measure(client.manager.facts)
+        client.manager.dispatcher.update(now + 10, client.manager.facts)
+        passed = page.locator("#attention-list li", has_text=late)
+        await passed.locator(".why", has_text="its deadline").wait_for()
+        assert "has passed" in await passed.inner_text()
+        assert "may miss" in await page.inner_text(f"#attention-list li:has-text('{near}')")
+        assert await page.locator("#attention-list li", has_text=far).count() == 0
+        assert (await page.inner_text(f"#tasks tr[data-task={far}]")).split("\t")[-1].startswith("from ")
+        await passed.locator("button", has_text="Prefer").click()
+        await page.wait_for_function("id => rceFleet.work.find(id).priority === 100", arg=late)
+
+
+async def test_a_task_that_was_cancelled_is_created_again(tmp_path: Path) -> None:
+    """Only one that no robot has begun; of another one, the page asks first."""
+    async with managed(tmp_path) as (_, client, page):
+        created = await page.evaluate(
+            "async (stops) => (await rceFleet.actions.createTask(stops, { priority: 7 })).id",
+            DELIVERY["stops"],
+        )
+        await page.locator(f"#task-{created}-cancel").click()
+        await until_state(page, created, "cancelled")
+        await page.locator("#undo").click()
+        await page.wait_for_function("rceFleet.work.tasks.size === 1")
+        again = next(client.manager.book.open_tasks())
+        assert (again.id != created, again.order.priority, again.order.stops[1].cells) == (True, 7, (21,))
+        visit = StopVisit(0, "Robot1", 18, 1.0, 2.0)
+        client.manager.book.put_record(replace(again, visits=(visit,), position=1, started_at=1.0))
+        await page.wait_for_function("id => rceFleet.work.find(id).position === 1", arg=again.id)
+        await page.locator(f"#task-{again.id}-cancel").click()
+        await page.locator("#question-no").click()
+        assert not client.manager.book.find(again.id).has_ended
+        await page.locator(f"#task-{again.id}-cancel").click()
+        await page.locator("#question-yes").click()
+        await until_state(page, again.id, "cancelled")
+
+
+async def test_an_undo_that_fails_can_be_tried_again(tmp_path: Path) -> None:
+    """Of cells of which one was refused, undo frees the others."""
+    async with managed(tmp_path) as (_, client, page):
+        client.manager.facts.is_live = False  # it keeps the cells in its journal
+        await page.evaluate("void rceFleet.actions.setCells([18, 64, 20], true)")  # 64 is not on the map
+        await page.locator("#message.bad", has_text="blocked 2 cells, 1 not; cell 64").wait_for()
+        blocked: Callable[[], tuple[int, ...]] = lambda: client.manager.book.blocked.cells
+        assert blocked() == (18, 20)
+        await page.route("**/api/v1/cells/*", lambda route: route.abort())
+        await page.locator("#undo:enabled").click()
+        await page.locator("#message.bad", has_text="fetch").wait_for()
+        await page.unroute("**/api/v1/cells/*")
+        await page.locator("#undo:enabled").click()
+        await page.locator("#message", has_text="freed 2 cells").wait_for()
+        assert blocked() == ()
+
+
+async def test_undo_of_a_mode_sets_the_one_before(tmp_path: Path) -> None:
+    """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
+    async with managed(tmp_path) as (made, _, page):
+        await page.evaluate("rceFleet.actions.setMode('automatic')")  # as it is already
+        await page.locator("#undo:enabled").click()
+        await page.locator("#message", has_text="undone").wait_for()
+        made.feed.on_change(made.view.on_changes({**changes(), "mode": "stopped"}))
+        await page.locator("#fleet-resume").click()
+        await page.locator("#question", has_text="the fleet is stopped").wait_for()
+        await page.locator("#question-yes").click()
+        await page.wait_for_function("rceFleet.fleet.mode === 'automatic'")
+        assert made.modes == ["automatic", "automatic", "automatic"]
+        assert await page.locator("#undo:enabled").count() == 0
+
+
+async def test_a_page_knows_how_long_robots_have_waited(tmp_path: Path) -> None:
+    """Also one that is opened later."""
+    async with managed(tmp_path) as (made, _, page):
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot1", state="waiting", cell=9))))
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').waitingSince !== null")
+        made.feed.waiting_since["Robot1"] -= 90
+        later = await made.open()
+        await later.locator("#attention-list li", has_text="has waited for 9").wait_for()
+
+
+async def test_a_robot_that_is_driven_by_its_poses_is_marked(tmp_path: Path) -> None:
+    async with managed(tmp_path) as (made, _, page):
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot1", state="driving", pose_only=True))))
+        row = page.locator("tr[data-robot=Robot1]")
+        await row.locator("td", has_text="driving, by poses").wait_for()
+        await row.click()
+        await page.locator("#robot-card", has_text="its move client answers nothing").wait_for()
+
+
+async def test_the_cursor_tells_what_is_in_its_cell(tmp_path: Path) -> None:
+    """In a live text; Enter on a robot's row moves the map to the robot."""
+    async with managed(tmp_path) as (_, client, page):
+        zone = {"kind": "slow", "value": 0.2, "cells": [1, 9]}
+        await client.ask("PUT", "/zones/aisle", zone)
+        await page.wait_for_function("rceFleet.work.zones.length === 1")
+        await page.locator("#map").focus()
+        for key in ("ArrowRight", "ArrowUp"):
+            await page.keyboard.press(key)
+        text = await page.locator("#cursor-text[aria-live=polite]").inner_text()
+        assert text == "cell 9, row 1, column 1, Robot1, idle, zone aisle"
+        await page.evaluate("rceFleet.view.camera.zoom(4)")
+        await page.locator("tr[data-robot=Robot2]").focus()
+        await page.keyboard.press("Enter")
+        await page.wait_for_function("rceFleet.fleet.selected === 'Robot2'")
+        x, y = await page.evaluate("rceFleet.view.screenOf(54)")
+        box = await page.locator("#map").bounding_box()
+        assert box is not None
+        assert (x, y) == pytest.approx((box["width"] / 2, box["height"] / 2), abs=2.0)
