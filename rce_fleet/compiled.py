@@ -63,7 +63,8 @@ class Kernel(Generic[P, R]):
         self.__name__ = loop.__name__
         self.__doc__ = loop.__doc__
         self._signatures = signatures
-        self._compiled: Callable[P, R] | None = None
+        self._compiled: Any = None
+        """numba's dispatcher."""
         self._used = numpy
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -75,6 +76,11 @@ class Kernel(Generic[P, R]):
         """Whether calls run the compiled loop."""
         return self._used is self._compiled
 
+    @property
+    def was_cached(self) -> bool:
+        """Whether numba's cache on disk had the compiled loop, in all of its forms."""
+        return self._compiled is not None and not self._compiled.stats.cache_misses
+
     def compile(self) -> Callable[P, R]:
         """Compile the loop if that has not been done, and return it; calls still run what they ran before.
 
@@ -83,7 +89,8 @@ class Kernel(Generic[P, R]):
         """
         if self._compiled is None:
             self._compiled = _jit(self.loop, list(self._signatures))
-        return self._compiled
+        compiled: Callable[P, R] = self._compiled
+        return compiled
 
     def use_compiled(self) -> None:
         """Compile the loop, and run it in calls from now on."""
@@ -149,6 +156,22 @@ def compile_kernels(kernels: Iterable[Kernel[..., Any]] | None = None) -> bool:
     for each in chosen:
         each.use_compiled()
     _log.info("%d inner loops compiled in %.1f s (numba)", len(chosen), perf_counter() - begin)
+    return True
+
+
+def load_kernels(kernels: Iterable[Kernel[..., Any]]) -> bool:
+    """Use compiled loops as far as numba's cache on disk has them; stop at the first that it does not have.
+
+    Returns:
+        Whether it had all of them.
+    """
+    if not is_available():
+        return False
+    _find_installed()
+    for each in kernels:
+        each.use_compiled()
+        if not each.was_cached:
+            return False
     return True
 
 

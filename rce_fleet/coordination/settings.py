@@ -7,6 +7,9 @@ from dataclasses import dataclass
 COMPILED_EFFORT = 1_000_000
 """Work spent on one plan at most where the planner's loops are compiled: about a second."""
 
+PLAN_TIMEOUT = 60.0
+"""Seconds after which the plan of a small fleet is given up. Plain loops need a second for 200 robots."""
+
 
 @dataclass(frozen=True, slots=True)
 class FleetSettings:
@@ -32,6 +35,8 @@ class FleetSettings:
         seed: Breaks ties in plans.
         effort: Work spent on one plan at most, see :class:`rce_fleet.planning.planner.PlanningProblem`. The
             planner's process spends :data:`COMPILED_EFFORT` where its loops are compiled.
+        plan_timeout: A plan of the planner's process that takes longer is given up, and the process is ended;
+            as much is added for each 500 robots.
         planner: Name of the planner: ``dijkstra``, or one that makes plans for all robots.
         resolve_deadlocks: Whether ``lacam`` plans for all when robots of the planner ``dijkstra`` wait for
             each other; otherwise their state only says so.
@@ -72,6 +77,7 @@ class FleetSettings:
     stall_timeout: float = 8.0
     seed: int = 0
     effort: int = 20_000
+    plan_timeout: float = PLAN_TIMEOUT
     planner: str = "lacam"
     resolve_deadlocks: bool = False
     quarter_turn: float = 0.0

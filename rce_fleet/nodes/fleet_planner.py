@@ -34,6 +34,7 @@ from rce_fleet.coordination.events import (
     Tick,
 )
 from rce_fleet.coordination.grid_change import next_planner, refuse_grid
+from rce_fleet.coordination.path_supply import INDEPENDENT
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import MapError, PlannerError, ZoneError
@@ -127,7 +128,8 @@ class PlannerNode:
         await node.advertise_service("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
         await self._poses.start()
         await self._state.start()  # last: who sees the state may call the services
-        async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
+        timeout = self._planner.settings.plan_timeout
+        async with PlanWorker(node.log, timeout=timeout) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
             tasks.create_task(self._keep_known())
@@ -135,7 +137,7 @@ class PlannerNode:
             gc.collect()
             gc.freeze()
             collect_all_seldom()
-            await self._keep_time()
+            await self._keep_time(worker)
             planning.cancel()
 
     # Robots
@@ -191,8 +193,11 @@ class PlannerNode:
 
     # What comes in
 
-    async def _keep_time(self) -> None:
+    async def _keep_time(self, worker: PlanWorker) -> None:
         while not self.successor and await self._node.sleep(TICK):
+            if self._planner.settings.planner != INDEPENDENT:  # that one asks for a plan after deadlocks only
+                robots = max(len(self._planner.state.robots), len(self._planner.expected))
+                worker.prepare(robots, len(self._planner.state.grid))
             self._handle(Tick())
             self._state.update(time.monotonic())
             self._poses.update(self._planner.state.robots, time.monotonic())

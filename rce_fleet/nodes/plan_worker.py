@@ -6,10 +6,14 @@ of a large fleet. The messages are small: a request with a few numbers per robot
 numbers for each step of a robot.
 
 The process reads requests from its standard input and ends with it. A few robots on a small map need no
-compiled loops. With the first larger request another process compiles the planner's inner loops into numba's
-cache, unless ``rce compile`` has done it. Robots must not stand for this half a minute: plans are made with
+compiled loops. For larger fleets and maps a process loads the planner's inner loops from numba's cache, which
+takes a second or two; the first large request waits for it. If the cache does not have them (``rce compile``
+fills it), another process compiles them. Robots must not stand for this half a minute: plans are made with
 the plain forms meanwhile. Then a process with compiled loops takes over. On the volume ``fleet`` the cache
-outlives the container, so that later starts load it within seconds.
+outlives the container.
+
+A planner of another package may never return, and a process may be stopped. So the time of a plan is limited;
+then the process is ended, and the robots continue without this plan.
 """
 
 from __future__ import annotations
@@ -29,10 +33,10 @@ from typing import TYPE_CHECKING, BinaryIO, Self
 
 import msgspec
 
-from rce_fleet.compiled import COMPILED, compile_kernels, is_available
+from rce_fleet.compiled import COMPILED, compile_kernels, is_available, load_kernels
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
 from rce_fleet.coordination.rerouting import Rerouting
-from rce_fleet.coordination.settings import COMPILED_EFFORT
+from rce_fleet.coordination.settings import COMPILED_EFFORT, PLAN_TIMEOUT
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
@@ -50,6 +54,12 @@ _CACHE_VARIABLE = "NUMBA_CACHE_DIR"
 _CACHE = "compiled"
 """Folder on the volume for compiled loops."""
 _FILL = "--compile"
+_CACHED = "--cached"
+"""Option of a process that ends unless the cache has all loops."""
+_LOAD_S = 15.0
+"""How long a large request waits for loops from the cache; on an idle machine they take a second or two."""
+_ROBOTS_PER_TIMEOUT = 500
+"""The time for a plan grows by the timeout for so many robots each."""
 _ROBOTS = 20
 _CELLS = 10_000
 """Loops are compiled for requests with at least so many robots, or cells; they take 150 MB."""
@@ -63,12 +73,22 @@ class PlanWorker:
         log: Logs restarts of the process.
         command: Command of the process.
         compiled: Whether a process with compiled loops takes over; None: if numba is installed.
+        timeout: Seconds for the plan of a few robots at most; larger fleets get more, see :meth:`time_for`.
+
+    Attributes:
+        timeout: See above.
     """
 
     def __init__(
-        self, log: logging.Logger, *, command: tuple[str, ...] = (), compiled: bool | None = None
+        self,
+        log: logging.Logger,
+        *,
+        command: tuple[str, ...] = (),
+        compiled: bool | None = None,
+        timeout: float = PLAN_TIMEOUT,
     ) -> None:
         self._log = log
+        self.timeout = timeout
         self._command = command or (sys.executable, "-P", "-m", __name__)
         self._to_compile = is_available() if compiled is None else compiled
         self._is_compiled = False
@@ -76,6 +96,8 @@ class PlanWorker:
         self._next: Process | None = None
         """Compiles, or has compiled loops and is not asked yet."""
         self._compiling: asyncio.Task[None] | None = None
+        self._cache_tried = asyncio.Event()
+        """Set when the loops are loaded from the cache, or it is known that it does not have them."""
 
     @property
     def is_compiled(self) -> bool:
@@ -97,25 +119,54 @@ class PlanWorker:
         self._process, self._next = self._next, None
         await self._end()
 
+    def prepare(self, robots: int, cells: int) -> None:
+        """Begin to load or compile the loops if a fleet or its map is so large; call it as soon as you know.
+
+        Args:
+            robots: Number of robots.
+            cells: Number of cells of the map.
+        """
+        if self._to_compile and is_large(robots, cells):
+            self._to_compile = False
+            self._compiling = asyncio.create_task(self._compile())
+
+    def time_for(self, robots: int) -> float:
+        """Return how many seconds a plan for so many robots may take."""
+        return self.timeout * (1 + robots / _ROBOTS_PER_TIMEOUT)
+
     async def _compile(self) -> None:
         """Prepare a process with compiled loops."""
         try:
-            self._next = await self._spawn(_FILL, compiled=True)
-            await self._next.wait()
-            self._next = await self._spawn(compiled=True)
-            assert self._next.stdout is not None
-            await self._next.stdout.readexactly(_LENGTH)
-        except (asyncio.IncompleteReadError, OSError) as error:
+            self._next = await self._spawn(_CACHED, compiled=True)
+            if not await _is_ready(self._next):
+                await self._next.wait()
+                self._cache_tried.set()
+                self._next = await self._spawn(_FILL, compiled=True)
+                await self._next.wait()
+                self._next = await self._spawn(compiled=True)
+                if not await _is_ready(self._next):
+                    status = _how_ended(await self._next.wait())
+                    self._next = None
+                    self._log.warning(
+                        "plans are made without compiled loops: their process ended (%s)", status
+                    )
+                    return
+        except OSError as error:
             self._next = None
             self._log.warning("plans are made without compiled loops: %s", error)
         else:
             self._log.info("plans are made with compiled loops from now on")
+        finally:
+            self._cache_tried.set()
 
-    def _compile_for(self, request: PlanRequest) -> None:
-        """Begin to compile if this is the first request that is so large."""
-        if self._to_compile and (len(request.robots) >= _ROBOTS or request.rows * request.columns >= _CELLS):
-            self._to_compile = False
-            self._compiling = asyncio.create_task(self._compile())
+    async def _await_cache(self) -> None:
+        """Wait for loops that are being loaded from the cache, for a limited time, and once only."""
+        try:
+            async with asyncio.timeout(_LOAD_S):
+                await self._cache_tried.wait()
+        except TimeoutError:
+            self._cache_tried.set()
+            self._log.info("compiled loops take long to load: plans are made without them meanwhile")
 
     async def _take_compiled(self) -> None:
         """Ask the process with compiled loops from now on, if it is ready."""
@@ -129,21 +180,38 @@ class PlanWorker:
     async def compute(self, request: PlanRequest) -> PlanResult:
         """Return a plan. If the process ends, it is restarted once.
 
-        If the planner fails, this is logged, and the plan has no visits: robots stand until single robots
-        find paths, or something changes and the next plan is asked for.
+        If the planner fails, or the plan takes longer than :meth:`time_for` allows, this is logged, and the
+        plan has no visits: robots stand until single robots find paths, or something changes and the next
+        plan is asked for.
 
         Cancelling leaves the process in the middle of its work: end it afterwards.
 
         Raises:
             PlanWorkerError: The process ended twice over this request.
         """
-        self._compile_for(request)
+        robots, cells = len(request.robots), request.rows * request.columns
+        self.prepare(robots, cells)
+        if self._compiling is not None and is_large(robots, cells):
+            await self._await_cache()
         await self._take_compiled()
-        result = await self._ask_twice(request)
+        seconds = self.time_for(robots)
+        try:
+            async with asyncio.timeout(seconds):
+                result = await self._ask_twice(request)
+        except TimeoutError:
+            await self._end()
+            result = failed_plan(request, f"it took longer than {seconds:.0f} s")
+            self._log.error(
+                "the planner %r made no plan %d for %d robots within %.0f s; it was ended, and robots"
+                " only get single paths until the next plan. If it needs more time, set the parameter"
+                " plan_timeout; if it never ends, set the parameter planner to another one, such as %s",
+                *(request.planner, request.number, robots, seconds, DEFAULT_PLANNER),
+            )
+            return result
         if result.failure:
             self._log.error(
                 "the planner %r failed in plan %d for %d robots: %s; see its traceback on stderr",
-                *(request.planner, request.number, len(request.robots), result.failure),
+                *(request.planner, request.number, robots, result.failure),
             )
         return result
 
@@ -153,17 +221,16 @@ class PlanWorker:
         except (asyncio.IncompleteReadError, ConnectionError):
             self._log.warning("the plan worker ended (%s); restarting it", await self._end(_ENDING_S))
         try:
-            await self._start()
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             status = await self._end(_ENDING_S)
             raise PlanWorkerError(request.number, len(request.robots), status) from error
 
-    async def _start(self) -> None:
-        self._process = await self._spawn(compiled=self._is_compiled)
-        if self._is_compiled:
-            assert self._process.stdout is not None
-            await self._process.stdout.readexactly(_LENGTH)
+    async def _start(self) -> Process:
+        process = self._process = await self._spawn(compiled=self._is_compiled)
+        if self._is_compiled and not await _is_ready(process):
+            raise ConnectionResetError("the process ended while it loaded its loops")
+        return process
 
     async def _spawn(self, *options: str, compiled: bool) -> Process:
         variables = dict(os.environ)
@@ -189,18 +256,35 @@ class PlanWorker:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             status = await process.wait()
-        return f"signal {-status}" if status < 0 else f"status {status}"
+        return _how_ended(status)
 
     async def _ask(self, request: PlanRequest) -> PlanResult:
-        process = self._process
-        if process is None:
-            raise ConnectionResetError("the process was ended")
+        process = self._process or await self._start()
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.write(_frame(msgspec.msgpack.encode(request)))
         await process.stdin.drain()
         length = int.from_bytes(await process.stdout.readexactly(_LENGTH))
         return msgspec.msgpack.decode(await process.stdout.readexactly(length), type=PlanResult)
+
+
+async def _is_ready(process: Process) -> bool:
+    """Wait until a process has its compiled loops; return False if it ended instead."""
+    assert process.stdout is not None
+    try:
+        await process.stdout.readexactly(_LENGTH)
+    except asyncio.IncompleteReadError:
+        return False
+    return True
+
+
+def _how_ended(status: int) -> str:
+    return f"signal {-status}" if status < 0 else f"status {status}"
+
+
+def is_large(robots: int, cells: int) -> bool:
+    """Return whether compiled loops are worth their memory for so many robots, or cells of a map."""
+    return robots >= _ROBOTS or cells >= _CELLS
 
 
 def serve(requests: BinaryIO, results: BinaryIO) -> None:
@@ -238,6 +322,13 @@ def failed_plan(request: PlanRequest, failure: str) -> PlanResult:
     return PlanResult(request.number, (), (), (), complete=False, rerouting=rerouting, failure=failure)
 
 
+def load_cached() -> bool:
+    """Use compiled loops if the cache has all that plans need; return whether it has."""
+    from rce_fleet.planning.lacam import KERNELS
+
+    return load_kernels((*KERNELS, *REROUTING_KERNELS))
+
+
 def load_compiled() -> Planner:
     """Compile the loops, and return the default planner."""
     compile_kernels(REROUTING_KERNELS)
@@ -256,12 +347,19 @@ def _frame(payload: bytes) -> bytes:
     return len(payload).to_bytes(_LENGTH) + payload
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Make plans; with an option of the command line, fill the cache, or only if the cache is filled."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the node, which then ends this process.
     if _FILL in sys.argv:
         os.nice(_LEAST_PRIORITY)
         threading.Thread(target=end_with_input, daemon=True).start()
         load_compiled()
-        sys.exit()
+        return
+    if _CACHED in sys.argv and not load_cached():
+        return
     with contextlib.suppress(BrokenPipeError):
         serve(sys.stdin.buffer, sys.stdout.buffer)
+
+
+if __name__ == "__main__":
+    main()

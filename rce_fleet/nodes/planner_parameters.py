@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 KNOWN = GRID_PARAMETERS | frozenset(
     {
         *("blocked", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
-        *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots"),
+        *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
     }
 )
 """Names of all parameters."""
@@ -37,12 +37,13 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         pose_only_after=read_number(values, "pose_only_after", default.pose_only_after),
         lost_spread=read_number(values, "lost_spread", default.lost_spread),
         lost_yaw=read_number(values, "lost_yaw", default.lost_yaw),
+        plan_timeout=read_number(values, "plan_timeout", default.plan_timeout),
         planner=str(values.get("planner", default.planner)),
         resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
         quarter_turn=read_number(values, "quarter_turn", 0.0),
         stop=read_number(values, "stop", 0.0),
     )
-    for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw"):
+    for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw", "plan_timeout"):
         if getattr(settings, name) <= 0:
             raise ValueError(f"the parameter {name} must be above 0, not {getattr(settings, name):g}")
     Motion(settings.quarter_turn, settings.stop)  # an impossible value has its reason

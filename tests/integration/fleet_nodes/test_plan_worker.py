@@ -16,7 +16,7 @@ import pytest
 from rce_fleet.coordination.replanning import PlanRequest, compute_plan
 from rce_fleet.coordination.rerouting import NO_CELL
 from rce_fleet.exceptions import PlanWorkerError
-from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.plan_worker import PlanWorker, is_large
 
 LOG = logging.getLogger("planner")
 
@@ -39,12 +39,15 @@ def request_of(number: int, robots: int = 3, *, size: int = 8, effort: int = 20_
 
 COMPILES_NOTHING = """
 import sys
-from rce_fleet.nodes.plan_worker import serve
+from rce_fleet.nodes import plan_worker
 from rce_fleet.planning import lacam
-lacam.KERNELS = ()
-if "--compile" not in sys.argv:
-    serve(sys.stdin.buffer, sys.stdout.buffer)
+lacam.KERNELS = plan_worker.REROUTING_KERNELS = ()
+if "--cached" in sys.argv and not IS_CACHED:
+    sys.exit()
+plan_worker.main()
 """
+EMPTY_CACHE = COMPILES_NOTHING.replace("IS_CACHED", "False")
+FULL_CACHE = COMPILES_NOTHING.replace("IS_CACHED", "True")
 
 
 def children_with(word: str) -> list[psutil.Process]:
@@ -173,10 +176,10 @@ async def test_a_process_with_compiled_loops_takes_over(monkeypatch: pytest.Monk
     """The loops of the process are left out here: to compile them takes half a minute."""
     pytest.importorskip("numba")
     monkeypatch.delenv("RCE_COMPILED", raising=False)
-    command = (sys.executable, "-P", "-c", COMPILES_NOTHING)
+    command = (sys.executable, "-P", "-c", EMPTY_CACHE)
     async with PlanWorker(LOG, command=command) as worker:
         assert await worker.compute(request_of(1)) == compute_plan(request_of(1))
-        assert len(children_with(COMPILES_NOTHING)) == 1, "a few robots need no compiled loops"
+        assert len(children_with(EMPTY_CACHE)) == 1, "a few robots need no compiled loops"
         assert await worker.compute(LARGE) == compute_plan(LARGE)
         async with asyncio.timeout(60):
             while not worker.is_compiled:
@@ -184,14 +187,14 @@ async def test_a_process_with_compiled_loops_takes_over(monkeypatch: pytest.Monk
         for number in (2, 3):
             request = request_of(number)
             assert await worker.compute(request) == compute_plan(request)
-        children = children_with(COMPILES_NOTHING)
+        children = children_with(EMPTY_CACHE)
         assert len(children) == 1
         os.kill(children[0].pid, signal.SIGKILL)
         assert await worker.compute(request_of(4)) == compute_plan(request_of(4))
 
 
 async def test_plans_are_made_if_nothing_can_be_compiled(caplog: pytest.LogCaptureFixture) -> None:
-    script = "import os, sys\nif os.environ.get('RCE_COMPILED') != 'no': sys.exit(1)\n" + COMPILES_NOTHING
+    script = "import os, sys\nif os.environ.get('RCE_COMPILED') != 'no': sys.exit(1)\n" + EMPTY_CACHE
     async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", script), compiled=True) as worker:
         assert await worker.compute(LARGE) == compute_plan(LARGE)
         async with asyncio.timeout(60):
@@ -199,3 +202,80 @@ async def test_plans_are_made_if_nothing_can_be_compiled(caplog: pytest.LogCaptu
                 await asyncio.sleep(0.05)
         assert await worker.compute(request_of(1)) == compute_plan(request_of(1))
         assert not worker.is_compiled
+
+
+async def test_first_large_plan_is_compiled_if_the_cache_is_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after each restart of a container: the request waits for the loops instead of the plain ones."""
+    pytest.importorskip("numba")
+    monkeypatch.delenv("RCE_COMPILED", raising=False)
+    monkeypatch.setattr("rce_fleet.nodes.plan_worker._LOAD_S", 600.0)
+    async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", FULL_CACHE)) as worker:
+        (plain,) = children_with(FULL_CACHE)
+        assert await worker.compute(LARGE) == compute_plan(LARGE)
+        (compiled,) = children_with(FULL_CACHE)
+        assert worker.is_compiled
+        assert compiled.pid != plain.pid
+        assert "--cached" in compiled.cmdline()
+
+
+async def test_loops_are_loaded_once_many_robots_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the first request; a small fleet on a small map needs none."""
+    pytest.importorskip("numba")
+    monkeypatch.delenv("RCE_COMPILED", raising=False)
+    async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", FULL_CACHE)) as worker:
+        assert not is_large(19, 9_999)
+        worker.prepare(20, 64)
+        async with asyncio.timeout(60):
+            while not worker.is_compiled:
+                await asyncio.sleep(0.05)
+
+
+NEVER_ENDS = """
+from rce_fleet.nodes import plan_worker
+
+class NeverEnds:
+    def plan(self, problem):
+        while problem.seed == 1:
+            pass
+        return lacam.plan(problem)
+
+lacam = plan_worker.load_planner("lacam")
+plan_worker.load_planner = lambda name: NeverEnds()
+plan_worker.main()
+"""
+
+
+async def test_a_planner_that_never_returns_is_ended(caplog: pytest.LogCaptureFixture) -> None:
+    """The plan is empty, the error names planner and parameter, and another process makes the next plan."""
+    command = (sys.executable, "-P", "-c", NEVER_ENDS)
+    async with PlanWorker(LOG, command=command, compiled=False, timeout=60) as worker:
+        request = replace(request_of(2), planner="mine")  # the process has started and can be timed
+        assert (await worker.compute(request)).complete
+        (first,) = children_with(NEVER_ENDS)
+        worker.timeout = 0.5
+        result = await worker.compute(replace(request_of(1), planner="mine"))
+        assert (result.number, result.cells, result.complete) == (1, (), False)
+        assert "longer than" in result.failure
+        assert not first.is_running()
+        worker.timeout = 60
+        assert (await worker.compute(request)).complete
+    (error,) = (record.getMessage() for record in caplog.records if record.levelno == logging.ERROR)
+    assert "the planner 'mine' made no plan 1 for 3 robots within" in error
+    assert "plan_timeout" in error
+
+
+async def test_a_stopped_plan_process_is_ended(caplog: pytest.LogCaptureFixture) -> None:
+    async with PlanWorker(LOG, compiled=False, timeout=0.5) as worker:
+        (first,) = workers()
+        os.kill(first.pid, signal.SIGSTOP)
+        assert (await worker.compute(request_of(1))).failure
+        assert not first.is_running()
+        worker.timeout = 60
+        assert await worker.compute(request_of(2)) == compute_plan(request_of(2))
+    assert "made no plan 1 for 3 robots" in caplog.text
+
+
+def test_large_fleets_have_more_time_for_a_plan() -> None:
+    worker = PlanWorker(LOG, compiled=False, timeout=60)
+    assert worker.time_for(0) == 60
+    assert worker.time_for(2000) == 300

@@ -45,6 +45,15 @@ loop = twice_plus.compile()
 print(sum(loop.stats.cache_hits.values()), twice_plus(10))
 """
 
+LOAD = """
+import sys
+from pathlib import Path
+from rce_fleet import compiled
+compiled.INSTALLED = Path(sys.argv[1])
+from the_loop import twice_plus
+print(compiled.load_kernels([twice_plus]))
+"""
+
 
 @dataclass
 class Cache:
@@ -67,6 +76,14 @@ class Cache:
         told = subprocess.run(argv, capture_output=True, text=True, check=True, env=env, cwd=ROOT)
         hits, answer = told.stdout.split()
         return int(hits), int(answer)
+
+    def load(self, own: Path) -> bool:
+        """Return whether a process found the loop in a cache."""
+        env = {key: value for key, value in os.environ.items() if key != "RCE_COMPILED"}
+        env |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": str(own)}
+        argv = [sys.executable, "-c", LOAD, str(self.folder / "installed")]
+        told = subprocess.run(argv, capture_output=True, text=True, check=True, env=env, cwd=ROOT)
+        return told.stdout.split() == ["True"]
 
 
 @pytest.fixture
@@ -112,6 +129,14 @@ def test_a_process_with_its_own_folder_compiles_nothing(cache: Cache, tmp_path: 
     assert cache.run("install") == (0, 12)
     assert cache.run("use", tmp_path / "own") == (1, 12)
     assert cache.run("use") == (1, 12)
+
+
+def test_loading_says_whether_the_cache_has_the_loops(cache: Cache, tmp_path: Path) -> None:
+    assert not cache.load(tmp_path / "empty")
+    assert cache.run("use", tmp_path / "own") == (0, 12)
+    assert cache.load(tmp_path / "own")
+    assert cache.run("install") == (0, 12)
+    assert cache.load(tmp_path / "another"), "as a container does with what rce compile made"
 
 
 def test_a_changed_helper_is_compiled_anew(cache: Cache) -> None:
