@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, cast
 
 from aiohttp import web
 
 from rce.web.faults import refuse_headers, request_log
+from rce.web.writing import UnreadAnswers
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Iterator, Mapping
 
     from rce.guard import Guest
 
@@ -34,6 +36,7 @@ class RunningApplication:
         self._guests = guests
         self._handled: set[Guest] = set()
         """Those whose request a handler works on."""
+        self._unread = UnreadAnswers()
         app.middlewares.insert(0, self._track)
         app.on_response_prepare.append(self._grant)
         self._runner = web.AppRunner(
@@ -64,14 +67,20 @@ class RunningApplication:
     async def _track(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Keep a connection's place in the lobby while its request is handled."""
+        """Keep a connection's place in the lobby while its request is handled; send the answer in time."""
         guest = None if request.transport is None else self._guests.get(request.transport)
-        if guest is None:
-            return await handler(request)
+        with nullcontext() if guest is None else self._handling(guest):
+            response = await handler(request)
+        if isinstance(response, web.Response) and not response.prepared:
+            await self._unread.send(request, response)
+        return response
+
+    @contextmanager
+    def _handling(self, guest: Guest) -> Iterator[None]:
         guest.speak()
         self._handled.add(guest)
         try:
-            return await handler(request)
+            yield
         finally:
             self._handled.discard(guest)
             guest.rest()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
 
+from rce.web.writing import write
 from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station.access import USER, problem
 from rce_fleet.station.events import EventCursor, EventFeed
@@ -26,10 +27,6 @@ EVENT_STREAM, CSV = "text/event-stream", "text/csv"
 MAX_STREAMS = 100
 """Open streams of events at one station."""
 AWAY_S = 2.0
-WRITE_S = 60.0
-"""How long a client may take nothing before its connection is dropped: it would keep its place for good."""
-PIECE = 1 << 16
-"""Bytes that a slow client is sent at once: it has so long for each."""
 MAX_ROWS = 1_000_000
 _PAGE = 1000
 _DIGITS = 18
@@ -87,13 +84,13 @@ class EventStreams:
         try:
             # A client that loses the stream before the first event resumes it here, too.
             begin = "" if cursor.number is None else f"id: {_id_of(cursor, cursor.number)}\n"
-            await _write(request, response, f"retry: 2000\n{begin}\n")
+            await write(request, response, f"retry: 2000\n{begin}\n".encode())
             while True:
                 frames = await _next_frames(cursor)
                 if not await self._access.is_still_allowed(request):
-                    await _write(request, response, ": your login has ended; log in again\n\n")
+                    await write(request, response, b": your login has ended; log in again\n\n")
                     return response
-                await _write(request, response, "".join(frames or [": no event\n\n"]))
+                await write(request, response, "".join(frames or [": no event\n\n"]).encode())
         except ConnectionError:
             return response
 
@@ -123,30 +120,13 @@ class EventStreams:
             page = json.loads(answer["body"])
             if response is None:
                 response = await _begin(request)
-            await _write(request, response, csv_rows(page["events"]))
+            await write(request, response, csv_rows(page["events"]).encode())
             after = page["next"]
             if len(page["events"]) < _PAGE:
                 break
         assert response is not None
         await response.write_eof()
         return response
-
-
-async def _write(request: web.Request, response: web.StreamResponse, text: str) -> None:
-    """Send a part of an answer.
-
-    Raises:
-        ConnectionError: The client is gone, or takes nothing.
-    """
-    data = text.encode()
-    for first in range(0, len(data), PIECE):
-        try:
-            async with asyncio.timeout(WRITE_S):
-                await response.write(data[first : first + PIECE])
-        except TimeoutError:
-            if request.transport is not None:
-                request.transport.abort()
-            raise ConnectionResetError("the client takes nothing") from None
 
 
 async def _next_frames(cursor: EventCursor) -> list[str]:

@@ -15,6 +15,7 @@ from yarl import URL
 
 from rce.web.client import Sent, noting_sent
 from rce.web.origin import is_foreign
+from rce.web.writing import write
 from rce_master.http.forwarded import HEADER
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ class Forwarder:
                 )
                 await response.prepare(request)
                 async for piece in reply.content.iter_any():
-                    await response.write(piece)
+                    await write(request, response, piece)
                 await response.write_eof()
         except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
             return self._broken(request, leader, response, error, sent)

@@ -9,6 +9,7 @@ import pytest
 from aiohttp import ClientSession, web
 from aiohttp.test_utils import TestServer
 
+from rce.web import writing
 from rce_fleet.station import event_streams
 from rce_fleet.station.event_streams import EventStreams
 from rce_fleet.station.events import EventBatch, EventFeed
@@ -33,7 +34,7 @@ async def ask(after: int, limit: int) -> EventBatch:
 async def test_a_stream_whose_client_takes_nothing_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of a program that hangs, or of a console that was stopped by Ctrl-Z."""
     monkeypatch.setattr(event_streams, "MAX_STREAMS", 1)
-    monkeypatch.setattr(event_streams, "WRITE_S", 0.5)
+    monkeypatch.setattr(writing, "WRITE_S", 0.5)
     streams = EventStreams(cast("Any", None), EventFeed(ask), cast("Any", Access()))
     app = web.Application()
     app.router.add_get("/events", streams.events)
