@@ -180,7 +180,7 @@ class Master:
         node_states = NodeStateServer(state_service, keeper, reconciler, self._fence)
         kept = ContentStore(self._settings.state_dir / SNAPSHOTS_FOLDER, noun=SNAPSHOT)
         copies = None if self._copies is None else self._copies(kept, SNAPSHOTS_PATH, SNAPSHOT)
-        snapshots = SnapshotService(state_service, kept, copies=copies)
+        snapshots = SnapshotService(state_service, kept, copies=copies, fence=self._fence)
         control_handler = ControlHandler(
             state_service, reconciler, authenticator, tokens, quotas, audit, self._fence, snapshots
         )

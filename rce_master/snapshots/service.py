@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
     from rce.control import VolumeSaved
+    from rce_master.leadership import Fence
     from rce_master.packages.contents import ContentStore
     from rce_master.packages.copies import ArchiveCopies
     from rce_master.state.changes import Changes
@@ -43,6 +44,10 @@ SNAPSHOT: Final = "snapshot"
 SPARED_S = 900.0
 """Contents that no volume needs are kept for so long after the connection on which they were sent has ended:
 the task set that sent them is about to report the snapshot that has them."""
+OFFER_S = 30.0
+"""Seconds that a task set may take to say what it has."""
+CONTENT_S = 120.0
+"""Seconds that it may take to send a content after the one before it, or to receive an answer."""
 _SLACK = 16 << 20
 """Bytes that a snapshot may have beyond the size of its volume: sizes of folders are only watched."""
 _CLOSE_CODE = 1008
@@ -56,6 +61,7 @@ class SnapshotService:
         store: Keeps the contents.
         clock: Seconds since 1970.
         copies: Those at other masters, if there may be any.
+        fence: Tells whether this master leads, if there may be others.
     """
 
     def __init__(
@@ -64,7 +70,9 @@ class SnapshotService:
         store: ContentStore,
         clock: Callable[[], float] = time.time,
         copies: ArchiveCopies | None = None,
+        fence: Fence | None = None,
     ) -> None:
+        self._fence = fence
         self._state_service = state_service
         self._store = store
         self._clock = clock
@@ -157,26 +165,42 @@ class SnapshotService:
 
     async def take(self, socket: ServerConnection) -> None:
         """Take the contents of a snapshot that a task set sends; return when it has hung up."""
-        with contextlib.suppress(ConnectionClosed):
+        try:
+            await self._take(socket)
+        except ConnectionClosed:
+            return
+        except msgspec.MsgspecError as error:
+            await socket.close(_CLOSE_CODE, f"not an offer: {error}"[:100])
+        except TimeoutError:
+            _log.warning("a snapshot from %s is given up: it takes too long", socket.remote_address)
+            await socket.close(_CLOSE_CODE, "it takes too long")
+        except FencedError as error:
+            _log.info("a snapshot is not answered: %s", error)
+            await socket.close(_CLOSE_CODE, str(error)[:100])
+
+    async def _take(self, socket: ServerConnection) -> None:
+        async with asyncio.timeout(OFFER_S):
+            offer = msgspec.json.decode(await socket.recv(), type=Offer)
+        known = self._state_service.tables.volumes.get(offer.volume)
+        if known is None:
+            await self._say(socket, Wanted(error=f"there is no volume {offer.volume!r}"))
+            return
+        with self._sparing(offer.contents):
+            answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))
             try:
-                offer = msgspec.json.decode(await socket.recv(), type=Offer)
-            except msgspec.MsgspecError as error:
-                await socket.close(_CLOSE_CODE, f"not an offer: {error}"[:100])
-                return
-            known = self._state_service.tables.volumes.get(offer.volume)
-            if known is None:
-                answer = Wanted(error=f"there is no volume {offer.volume!r}")
-                await socket.send(msgspec.json.encode(answer).decode())
-                return
-            with self._sparing(offer.contents):
-                answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))
-                try:
-                    await socket.send(msgspec.json.encode(answer).decode())
-                    await self._receive(socket, known.size)
-                finally:
-                    # The task set has yet to report the snapshot: the contents are spared from now.
-                    with contextlib.suppress(OSError):
-                        await asyncio.to_thread(self._missing, offer.contents)
+                await self._say(socket, answer)
+                await self._receive(socket, known.size)
+            finally:
+                # The task set has yet to report the snapshot: the contents are spared from now.
+                with contextlib.suppress(OSError):
+                    await asyncio.to_thread(self._missing, offer.contents)
+
+    async def _say(self, socket: ServerConnection, answer: Wanted | Kept) -> None:
+        """Send an answer, unless another master may lead by now."""
+        if self._fence is not None:
+            self._fence.check()
+        async with asyncio.timeout(CONTENT_S):
+            await socket.send(msgspec.json.encode(answer).decode())
 
     @contextlib.contextmanager
     def _sparing(self, contents: Collection[str]) -> Iterator[None]:
@@ -193,7 +217,8 @@ class SnapshotService:
     async def _receive(self, socket: ServerConnection, most: int) -> None:
         left = most + _SLACK + MAX_MANIFEST
         while True:
-            data = await socket.recv()
+            async with asyncio.timeout(CONTENT_S):
+                data = await socket.recv()
             left -= len(data)
             kept = Kept()
             if isinstance(data, str) or left < 0:
@@ -204,7 +229,7 @@ class SnapshotService:
                         await self._store.keep(incoming)
                 except MasterError as error:
                     kept = Kept(error=str(error))
-            await socket.send(msgspec.json.encode(kept).decode())
+            await self._say(socket, kept)
 
     async def accept(self, process: str, message: VolumeSaved) -> None:
         """Note a snapshot that a task set has sent, once its contents are where they have to be.

@@ -13,16 +13,21 @@ from pathlib import Path
 import pytest
 from support.control_ends import SECRET
 from support.engine import until
+from websockets.asyncio.server import ServerConnection
 
 from rce.aio.tasks import cancel_and_wait
+from rce.control.exceptions import SnapshotError
 from rce.control.messages import ToMaster, VolumeSaved
-from rce.control.snapshots import FileEntry, Manifest, Offer
+from rce.control.snapshots import UPLOADS, FileEntry, Manifest, Offer
 from rce.control_channel.dialing import Dialer
 from rce.control_channel.peer import Peer
 from rce.control_channel.server import ControlServer
 from rce.control_channel.uploads import Uploader
 from rce.masters import Masters
+from rce_master.leadership import Fence
+from rce_master.leadership.core import LeadershipCore, LeaseSettings
 from rce_master.packages.contents import ContentStore
+from rce_master.snapshots import service
 from rce_master.snapshots.service import SNAPSHOT, SPARED_S, SnapshotService
 from rce_master.state.volume_records import UserVolume
 from rce_master.state_service import StateService
@@ -42,11 +47,14 @@ OFFER = Offer(volume=VOLUME.id, contents=[NAME, PIECE_NAME])
 class Kept:
     """A master, as far as snapshots are concerned."""
 
-    def __init__(self, folder: Path, state_service: StateService, uploader: Uploader) -> None:
+    def __init__(self, folder: Path, state_service: StateService, dialer: Dialer) -> None:
         self.folder = folder
         self.state_service = state_service
         self.service = SnapshotService(state_service, ContentStore(folder, noun=SNAPSHOT))
-        self.uploader = uploader
+        self.dialer = dialer
+        self.uploader = Uploader(dialer)
+        self.socket: ServerConnection
+        """The master's end of the newest connection."""
 
     @property
     def volume(self) -> UserVolume:
@@ -93,8 +101,9 @@ async def kept(tmp_path: Path) -> AsyncIterator[Kept]:
     async def ignore_message(_: Peer, __: ToMaster) -> None:
         return
 
-    async def take(socket: object) -> None:
-        await made.service.take(socket)  # type: ignore[arg-type]
+    async def take(socket: ServerConnection) -> None:
+        made.socket = socket
+        await made.service.take(socket)
 
     state_service = await StateService.open(MemoryStore())
     state_service.tables.volumes.assign(VOLUME.id, VOLUME)
@@ -102,8 +111,8 @@ async def kept(tmp_path: Path) -> AsyncIterator[Kept]:
         SECRET, on_hello=ignore, on_message=ignore_message, on_gone=ignore, port=0, on_upload=take
     )
     async with server:
-        uploader = Uploader(Dialer(Masters([f"ws://127.0.0.1:{server.port}"]), SECRET))
-        made = Kept(tmp_path / "snapshots", state_service, uploader)
+        dialer = Dialer(Masters([f"ws://127.0.0.1:{server.port}"]), SECRET)
+        made = Kept(tmp_path / "snapshots", state_service, dialer)
         running = asyncio.create_task(state_service.run())
         try:
             yield made
@@ -151,3 +160,47 @@ async def test_contents_of_a_broken_upload_go_after_a_while(kept: Kept) -> None:
     await until(lambda: not kept.service._coming, what="the end of the connection is noted")
     await kept.sweep()
     assert kept.held() == set()
+
+
+async def test_a_task_set_that_sends_nothing_more_is_given_up(
+    kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its contents would be spared for as long as it stays connected."""
+    monkeypatch.setattr(service, "CONTENT_S", 0.1)
+
+    async def send_late() -> None:
+        async with kept.uploader.upload(OFFER) as upload:
+            await kept.socket.wait_closed()
+            await upload.send(PIECE)
+
+    with pytest.raises(SnapshotError, match="it takes too long"):
+        await send_late()
+
+
+async def test_a_task_set_that_offers_nothing_is_given_up(
+    kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "OFFER_S", 0.1)
+    async with kept.dialer.connect(UPLOADS, 1 << 20) as master, asyncio.timeout(60):
+        await master.wait_closed()
+        assert master.close_reason == "it takes too long"
+
+
+async def test_a_master_without_the_lead_keeps_no_snapshot(kept: Kept) -> None:
+    core = LeadershipCore(LeaseSettings(ttl=3.0))
+    core.granted(0.0, 3.0)
+    core.elected(1, 0.0)
+    now = 1.0
+    kept.service = SnapshotService(
+        kept.state_service, ContentStore(kept.folder, noun=SNAPSHOT), fence=Fence(core, lambda: now, "one")
+    )
+
+    async def send() -> None:
+        nonlocal now
+        async with kept.uploader.upload(OFFER) as upload:
+            now = 10.0
+            await upload.send(PIECE)
+            await upload.finish()
+
+    with pytest.raises(SnapshotError, match="leads no more"):
+        await send()
