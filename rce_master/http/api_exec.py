@@ -12,6 +12,7 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_COMMAND, NOT_RUN, Command, ended_frame, read_command
+from rce.web.writing import write_in_time
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http.routes import OF_USER, Call, route_table
 
@@ -55,7 +56,7 @@ async def execute(call: Call) -> web.StreamResponse:
     except (MasterError, ValueError, TimeoutError) as error:
         text = str(error) or f"no command came within {FIRST_MESSAGE_S:g} s"
         with contextlib.suppress(ConnectionError):
-            await user.send_bytes(ended_frame(NOT_RUN, text).encode())
+            await write_in_time(call.request, user.send_bytes(ended_frame(NOT_RUN, text).encode()))
     await user.close()
     return user
 
@@ -78,25 +79,32 @@ async def _first(user: web.WebSocketResponse) -> Command:
 
 
 async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
-    """Pass frames on until either side disconnects, or the user loses the permission."""
+    """Pass frames on until either side disconnects or takes nothing, or the user loses the permission.
+
+    Raises:
+        FencedError: This master leads no more.
+        ValueError: The login has ended, or the user sends what is not a frame.
+    """
     with contextlib.suppress(ConnectionClosed, ConnectionError):  # either side may disconnect
-        await run_until_first(_to_machine(user, machine), _to_user(machine, user), _watch(call))
+        await run_until_first(_to_machine(call, user, machine), _to_user(call, machine, user), _watch(call))
 
 
-async def _to_machine(user: web.WebSocketResponse, machine: ServerConnection) -> None:
+async def _to_machine(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
     async for message in user:
         if message.type is not WSMsgType.BINARY:
             raise ValueError("only binary frames may follow the command")
+        call.check_lead()
         with contextlib.suppress(
             ConnectionClosed
         ):  # the command has ended; its last frames are still passed on
             await machine.send(message.data)
 
 
-async def _to_user(machine: ServerConnection, user: web.WebSocketResponse) -> None:
+async def _to_user(call: Call, machine: ServerConnection, user: web.WebSocketResponse) -> None:
     async for frame in machine:
         if isinstance(frame, bytes):
-            await user.send_bytes(frame)
+            call.check_lead()
+            await write_in_time(call.request, user.send_bytes(frame))
 
 
 async def _watch(call: Call) -> None:

@@ -15,7 +15,7 @@ from msgspec.structs import asdict
 from rce.control import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import AT_ONCE, GAP, Event
-from rce_master.exceptions import InvalidRequestError
+from rce_master.exceptions import FencedError, InvalidRequestError
 from rce_master.http import models
 from rce_master.http.paging import MAX_ITEMS, PAGE
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
@@ -161,26 +161,26 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
     await response.prepare(call.request)
     events = call.services.events
     gap = _gap(call, scope, last)
-    await response.write(b": hello\n\n" + (b"" if gap is None else _frame(gap)))
-    last = last if gap is None else gap.id
     clock = asyncio.get_running_loop().time
-    written = clock()
     try:
+        await call.write(response, b": hello\n\n" + (b"" if gap is None else _frame(gap)))
+        last = last if gap is None else gap.id
+        written = clock()
         while True:
             news = await events.wait(last, max(0.0, written + HEARTBEAT_S - clock()), scope)
             if not call.is_still_valid:
-                await response.write(_frame(_farewell(call, last)))
+                await call.write(response, _frame(_farewell(call, last)))
                 return response
             # Periodic comments prevent timeouts of proxies, and detect that a client has disconnected.
             frames = [_frame(event) for event in news if event.time >= born and _concerns(call, event)]
             if frames or clock() >= written + HEARTBEAT_S:
-                await response.write(b"".join(frames) or b":\n\n")
+                await call.write(response, b"".join(frames) or b":\n\n")
                 written = clock()
             last = news[-1].id if news else last
             if len(news) == AT_ONCE:
                 await call.services.quotas.replay(call.caller)
-    except ConnectionError:
-        # The client disconnected: a stream does not end in another way from its side.
+    except (ConnectionError, FencedError):
+        # The client disconnected, or another master leads and is asked next, from the last event on.
         return response
 
 

@@ -6,7 +6,7 @@ from aiohttp import web
 from msgspec import json
 
 from rce.web.openapi import Query
-from rce_master.exceptions import InvalidRequestError
+from rce_master.exceptions import FencedError, InvalidRequestError
 from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of_users, whole
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 from rce_master.http.usage_models import ContainerUsageOut, UsageOut
@@ -60,14 +60,14 @@ async def _stream(call: Call, interval: int) -> web.StreamResponse:
     )
     await response.prepare(call.request)
     try:
-        await response.write(await _frame(call))
+        await call.write(response, await _frame(call))
         while True:
             if not await call.lasts(interval):
-                await response.write(b": %s\n\n" % ENDED.encode())
+                await call.write(response, b": %s\n\n" % ENDED.encode())
                 return response
-            await response.write(await _frame(call))
-    except ConnectionError:
-        # The client disconnected: a stream does not end in another way from its side.
+            await call.write(response, await _frame(call))
+    except (ConnectionError, FencedError):
+        # The client disconnected, or another master leads.
         return response
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
 
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from rce_master.leadership import Fence
     from rce_master.leadership.drains import MasterDrains
     from rce_master.state_service import StateService
+
+
+HEALTH_PATH: Final = "/healthz"
 
 
 class Health:
@@ -39,16 +42,24 @@ class Health:
         if self._look is None:
             self._look = asyncio.create_task(self._check())
         fault = await asyncio.shield(self._look)
+        if self._fence is not None and self._fence.is_closed:
+            return web.json_response(self._fenced(self._fence), status=503)
         tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
         body: dict[str, object] = {"status": fault or "ok", "task_sets": connected}
         if self._fence is not None:
-            self._fence.check()
-            drained = self._drains is not None and self._drains.is_drained
-            body |= describe_role(
-                "leader", self._fence.term, self._fence.name, ready=not fault, drained=drained
-            )
+            term, name, drained = self._fence.term, self._fence.name, self._is_drained
+            body |= describe_role("leader", term, name, ready=not fault, drained=drained)
         return web.json_response(body, status=503 if fault else 200)
+
+    def _fenced(self, fence: Fence) -> dict[str, object]:
+        """Answer as the stand-by that this master is about to be."""
+        role = describe_role("standby", fence.term, "", ready=False, drained=self._is_drained)
+        return {"status": "stand-by; this master led until now", **role}
+
+    @property
+    def _is_drained(self) -> bool:
+        return self._drains is not None and self._drains.is_drained
 
     async def _check(self) -> str:
         try:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rce.guard import TrustedProxies
 from rce.web import routes
 from rce.web.openapi import Query
+from rce.web.writing import write
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http.forwarded import HEADER, ForwardingKey
 from rce_master.state.user_records import User, UserRole
@@ -131,6 +132,25 @@ class Call:
         """
         user, _ = self.services.tokens.find(self.token)
         return user
+
+    async def write(self, response: StreamResponse, data: bytes) -> None:
+        """Send a part of a stream.
+
+        Raises:
+            ConnectionError: The client is gone, or takes nothing.
+            FencedError: This master leads no more, and says nothing that another one may have changed.
+        """
+        self.check_lead()
+        await write(self.request, response, data)
+
+    def check_lead(self) -> None:
+        """Check that this master leads, if there may be others.
+
+        Raises:
+            FencedError: It does not.
+        """
+        if self.services.fence is not None:
+            self.services.fence.check()
 
     async def lasts(self, seconds: float) -> bool:
         """Wait; return False as soon as the caller has lost the permission."""

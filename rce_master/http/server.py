@@ -25,7 +25,7 @@ from rce_master.exceptions import (
     UnderWayError,
 )
 from rce_master.http.access import check_metrics
-from rce_master.http.health import Health
+from rce_master.http.health import HEALTH_PATH, Health
 from rce_master.http.late import LateApi
 from rce_master.http.origin_guard import origin_guard
 
@@ -61,7 +61,7 @@ def make_app(
     inner = [] if fence is None else [_fencing(fence), settling(services.state_service, fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
-    app.router.add_get("/healthz", Health(services.state_service, services.fence, services.drains).handle)
+    app.router.add_get(HEALTH_PATH, Health(services.state_service, services.fence, services.drains).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
@@ -110,7 +110,9 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
 def _fencing(fence: Fence) -> Any:
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Answer nothing from a state that another master may have changed."""
+        """Answer nothing from a state that another master may have changed; streams check each write."""
+        if request.path == HEALTH_PATH:
+            return await handler(request)
         fence.check()
         try:
             response = await handler(request)

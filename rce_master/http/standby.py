@@ -9,7 +9,7 @@ from aiohttp import hdrs, web
 
 from rce.web.origin import ServerNames
 from rce_master.http.forward import NotForwardedError
-from rce_master.http.health import describe_role
+from rce_master.http.health import HEALTH_PATH, describe_role
 from rce_master.http.origin_guard import origin_guard
 from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
@@ -48,7 +48,7 @@ def make_standby_app(
     """
     standby = _Standby(keeper, follower, forwarder)
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
-    app.router.add_get("/healthz", standby.health)
+    app.router.add_get(HEALTH_PATH, standby.health)
     app.router.add_get("/metrics", standby.metrics)
     for one in for_leader:
         one.add_to(app)

@@ -26,6 +26,7 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointStatus
 from rce.control_channel.channel import TaskSetChannel
+from rce_master.leadership import Fence
 from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings
 from rce_master.settings import MasterSettings
@@ -58,6 +59,7 @@ class RunSite(Protocol):
         state_dir: Path | None = None,
         *,
         log_in: bool = True,
+        fence: Fence | None = None,
         **options: Unpack[MasterOptions],
     ) -> AbstractAsyncContextManager[Site]: ...
 
@@ -189,6 +191,7 @@ async def running_site(
     state_dir: Path | None = None,
     *,
     log_in: bool = True,
+    fence: Fence | None = None,
     **options: Unpack[MasterOptions],
 ) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports, and log in."""
@@ -197,7 +200,7 @@ async def running_site(
     state_dir = state_dir or Path(spare.name)
     settings = MasterSettings(bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, **options)
     ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
-    master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER)
+    master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER, fence=fence)
     task = asyncio.create_task(master.run(ready.set_result))
     try:
         task.add_done_callback(lambda _: ready.done() or ready.cancel())
