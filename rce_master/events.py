@@ -124,11 +124,14 @@ class EventLog:
         """Return where a follower who resumes after an event goes on; None if no event is missing.
 
         Args:
-            id_: The event, which may be one of the time before this master started or led.
+            id_: The event, which may be one of the time before this master started or led, also a greater
+                one: the engine had another store then, or its clock was set back.
             user: Of this user only; None: of all.
         """
         logs = self._events.values() if user is None else filter(None, [self._events.get(user)])
         start = self._first_id - 1
+        if id_ > self.last_id:
+            return start
         forgotten = max((log.forgotten for log in logs), default=start)
         return max(id_, start) if id_ < max(start, forgotten) else None
 

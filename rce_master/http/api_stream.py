@@ -135,10 +135,12 @@ def _page(call: Call, scope: str | None) -> models.EventsOut:
     if not 0 < limit <= MAX_ITEMS:
         raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_ITEMS}")
     born = _born(call, scope)
+    if (gap := _gap(call, scope, since)) is not None:
+        since = gap.id
     found = log.since(since, limit + 1, scope)
     has_more, found = len(found) > limit, found[:limit]
     shown = [event for event in found if event.time >= born and _concerns(call, event)]
-    if (gap := _gap(call, scope, since)) is not None:
+    if gap is not None:
         shown.insert(0, gap)
     return models.EventsOut(
         events=[models.EventOut(**asdict(event)) for event in shown],

@@ -237,6 +237,29 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     assert late[1:] == everything
 
 
+async def test_events_after_a_greater_id_begin_with_a_gap(site: Site) -> None:
+    """A follower has an id of the time when the engine's store was etcd; a stream and pages tell it the same."""
+    await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+    everything = await read_events(site, 2, site.token, since=0)
+    former = 10_010_000_000_007
+    gap, *events = await read_events(site, 3, site.token, last=former)
+    assert gap["kind"] == "gap"
+    assert gap["id"] < everything[0]["id"]
+    assert events == everything
+    headers = {"Authorization": f"Bearer {site.token}", "Accept": "application/json"}
+    found, since = [], former
+    for _ in range(4):
+        query = {"since": since, "limit": 1}
+        async with site.session.get(f"{site.url}api/v1/events", headers=headers, params=query) as reply:
+            page = await reply.json()
+        found += page["events"]
+        since = int(page["next"] or page["newest"])
+    assert [(event["kind"], event["id"]) for event in found] == [
+        (event["kind"], event["id"]) for event in (gap, *everything)
+    ]
+    assert since == everything[-1]["id"]
+
+
 async def test_user_does_not_see_a_predecessors_records(site: Site) -> None:
     """A user does not see what one of the same name did before."""
     anna = {"name": "anna", "password": "one"}

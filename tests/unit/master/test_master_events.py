@@ -41,6 +41,19 @@ def test_what_a_follower_missed_is_known() -> None:
     assert log.missed(999, "carl") is None
 
 
+def test_a_greater_id_than_the_newest_is_of_another_time() -> None:
+    """The engine was moved from etcd to SQLite, whose ids are smaller, or its clock was set back."""
+    before = EventLog(1.8e9, term=1)
+    before.add(state_event("before"), 1.8e9)
+    log = EventLog(1.8e9)
+    log.add(state_event("first"), 1.8e9)
+    assert log.missed(log.last_id) is None
+    missed = log.missed(before.last_id, "anna")
+    assert missed is not None
+    assert [event.text for event in log.since(missed, user="anna")] == ["first"]
+    assert log.missed(before.last_id, "carl") == log.missed(before.last_id) == missed
+
+
 def test_the_ring_keeps_the_newest() -> None:
     log = EventLog(0.0, capacity=3)
     for number in range(5):
