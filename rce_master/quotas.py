@@ -1,6 +1,7 @@
 """Quotas of one user's requests, streams and reads of logs.
 
-Usage is counted per user, so that one user does not affect another. Quotas do not apply to administrators.
+Usage is counted per user, so that one user does not affect another. Quotas do not apply to administrators;
+only their lists are made one after the other, too.
 """
 
 from __future__ import annotations
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
 READS_AT_ONCE = 32
 READS_WAITING = 512
 """Waiting reads of logs of all users; beyond it, the user with the most is told to try later."""
+LISTS_AT_ONCE = 4
+"""Lists that are made for all users at the same time, one of each user: a long one counts as one request, and
+between two turns of the event loop a piece of each is made."""
+LISTS_WAITING = 2048
+"""Waiting lists of all users; beyond it, the user with the most is told to try later."""
 REPLAY_BURST = 200
 """Parts of past events that a user's streams send without a pause: twice all events that are kept."""
 ITEMS_PER_REQUEST = 20
@@ -62,6 +68,7 @@ class Quotas:
         self._replays = self._rates(min(burst, REPLAY_BURST))
         self._streams: Counter[str] = Counter()
         self._reads = Turns(READS_AT_ONCE, waiting=READS_WAITING, each=self._settings.log_reads)
+        self._lists = Turns(LISTS_AT_ONCE, waiting=LISTS_WAITING, each=1)
 
     def request(self, user: User) -> None:
         """Count a request over REST.
@@ -118,17 +125,18 @@ class Quotas:
         Raises:
             TooMuchError: Too many of the user's reads wait.
         """
-        turn = self._reads.turn(user.name)
-        try:
-            await turn.__aenter__()
-        except CrowdedError:
-            raise TooMuchError(
-                "too many of your reads of logs wait already; read one after the other", 1
-            ) from None
-        try:
+        async with _turn(self._reads, user, "reads of logs"):
             yield
-        finally:
-            await turn.__aexit__(None, None, None)
+
+    @contextlib.asynccontextmanager
+    async def making_list(self, user: User) -> AsyncIterator[None]:
+        """Wait until a list, or a page of one, may be made for a user; administrators wait for theirs, too.
+
+        Raises:
+            TooMuchError: Too many of the user's lists wait.
+        """
+        async with _turn(self._lists, user, "lists"):
+            yield
 
     def _rates(self, burst: int) -> Rates | None:
         if not self._settings.requests:
@@ -145,3 +153,16 @@ class Quotas:
                 f"try again in {math.ceil(wait)} s",
                 wait,
             )
+
+
+@contextlib.asynccontextmanager
+async def _turn(turns: Turns, user: User, what: str) -> AsyncIterator[None]:
+    turn = turns.turn(user.name)
+    try:
+        await turn.__aenter__()
+    except CrowdedError:
+        raise TooMuchError(f"too many of your {what} wait already; read one after the other", 1) from None
+    try:
+        yield
+    finally:
+        await turn.__aexit__(None, None, None)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from aiohttp import web
 from msgspec import json
 
 from rce.web.openapi import Query
-from rce_master.exceptions import FencedError, InvalidRequestError
+from rce_master.exceptions import FencedError, InvalidRequestError, TooMuchError
 from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of_users, whole
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 from rce_master.http.usage_models import ContainerUsageOut, UsageOut
@@ -28,9 +30,8 @@ async def show_usage(call: Call) -> web.Response:
     """Show the usage."""
     views = _views(call)
     # The machines belong to the first page: the others are about containers only.
-    return await answer(
-        call, _listing(call, views), **_others(call, views, is_first="cursor" not in call.request.query)
-    )
+    others = partial(_others, call, views, is_first="cursor" not in call.request.query)
+    return await answer(call, _listing(call, views), others)
 
 
 @routes.route(
@@ -73,7 +74,10 @@ async def _stream(call: Call, interval: int) -> web.StreamResponse:
 
 async def _frame(call: Call) -> bytes:
     views = _views(call)
-    usage = await whole(_listing(call, views), **_others(call, views, is_first=True))
+    try:
+        usage = await whole(call, _listing(call, views), partial(_others, call, views, is_first=True))
+    except TooMuchError as error:
+        return b": %s\n\n" % str(error).encode()
     return b"event: usage\ndata: %s\n\n" % usage
 
 
@@ -92,8 +96,8 @@ def _listing(call: Call, views: UsageViews) -> Listing:
     )
 
 
-def _others(call: Call, views: UsageViews, *, is_first: bool) -> dict[str, bytes]:
-    machines = views.machines() if call.is_admin and is_first else []
+async def _others(call: Call, views: UsageViews, *, is_first: bool) -> dict[str, bytes]:
+    machines = await views.machines() if call.is_admin and is_first else []
     rows = b",".join(machine.model_dump_json().encode() for machine in machines)
     return {"time": json.encode(call.services.clock()), "machines": b"[%s]" % rows}
 

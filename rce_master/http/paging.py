@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from heapq import nsmallest
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,7 +22,7 @@ from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable
 
     from rce_master.http.model import Model
     from rce_master.http.routes import Call
@@ -32,6 +33,9 @@ MAX_ITEMS = 1000
 """In one page."""
 _PIECE = 50
 """Items between two turns of the event loop."""
+
+Others = Callable[[], Awaitable[Mapping[str, bytes]]]
+"""Makes the fields of an answer beside its list, in JSON."""
 
 PAGE = (
     Query(
@@ -93,38 +97,45 @@ class Listing:
     the items are iterated over."""
 
 
-async def answer(call: Call, listing: Listing, **others: bytes) -> web.Response:
-    """Answer a request for a list.
+async def answer(call: Call, listing: Listing, others: Others | None = None) -> web.Response:
+    """Answer a request for a list, once no other list is made for the caller.
 
     Args:
         call: The request.
         listing: The list.
-        others: Other fields of the answer, in JSON.
+        others: Makes other fields of the answer.
 
     Raises:
         InvalidRequestError: ``limit`` or ``cursor`` is wrong.
+        TooMuchError: Too many lists of the caller wait.
     """
     query = call.request.query
     cursor = _Cursor.read(query["cursor"]) if query.get("cursor") else None
     limit = call.number("limit", MAX_ITEMS)
     if not 0 < limit <= MAX_ITEMS:
         raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_ITEMS}")
-    if cursor is None and "limit" not in query:
-        body = await whole(listing, **others)
-    else:
-        rows, after = await _page(listing, limit, cursor)
-        body = _body(listing, rows, after, others)
+    is_whole = cursor is None and "limit" not in query
+    async with call.services.quotas.making_list(call.caller):
+        fields = {} if others is None else await others()
+        rows, after = (await _whole(listing), None) if is_whole else await _page(listing, limit, cursor)
+        body = _body(listing, rows, after, fields)
     return web.Response(body=body, content_type="application/json")
 
 
-async def whole(listing: Listing, **others: bytes) -> bytes:
-    """Return the JSON of an answer with a whole list.
+async def whole(call: Call, listing: Listing, others: Others) -> bytes:
+    """Return the JSON of an answer with a whole list, once no other list is made for the caller.
 
     Args:
+        call: The request.
         listing: The list.
-        others: Other fields of the answer, in JSON.
+        others: Makes other fields of the answer.
+
+    Raises:
+        TooMuchError: Too many lists of the caller wait.
     """
-    return _body(listing, await _whole(listing), None, others)
+    async with call.services.quotas.making_list(call.caller):
+        fields = await others()
+        return _body(listing, await _whole(listing), None, fields)
 
 
 def _body(listing: Listing, rows: list[bytes], after: str | None, others: Mapping[str, bytes]) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from functools import cached_property
 from heapq import nsmallest
 from typing import TYPE_CHECKING
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from rce_master.state.records import Container
     from rce_master.state.tables import Tables
 
+_PIECE = 200
+"""Containers of a machine between two turns of the event loop."""
 _NOTHING = EndpointUsage()
 _NO_NODE_USAGE = NodeUsage()
 
@@ -89,19 +92,23 @@ class UsageViews:
         reported = {node.tag: node for node in status.nodes} if status else {}
         return [_node(tag, reported.get(tag), history) for tag in container.nodes]
 
-    def machines(self) -> list[models.MachineUsageOut]:
-        """Show all container machines."""
+    async def machines(self) -> list[models.MachineUsageOut]:
+        """Show all container machines; other tasks run meanwhile."""
         return [
-            self._machine(room, [other for other in self._emptiest if other is not room])
+            await self._machine(room, [other for other in self._emptiest if other is not room])
             for room in self._rooms.values()
         ]
 
-    def _machine(self, room: Room, others: list[Room]) -> models.MachineUsageOut:
-        histories = [
-            history
-            for endpoint in self._tables.endpoints.by("task_set", room.process)
-            if (history := self._book.history(room.process, endpoint.id)) is not None
-        ]
+    async def _machine(self, room: Room, others: list[Room]) -> models.MachineUsageOut:
+        cpu, memory = 0.0, 0
+        for number, id_ in enumerate(list(self._tables.endpoints.keys("task_set", room.process)), 1):
+            history = self._book.history(room.process, id_)
+            if history is not None:
+                cpu += history.rates.cpu
+                memory += history.now.usage.memory
+            if number % _PIECE == 0:
+                await asyncio.sleep(0)
+        await asyncio.sleep(0)
         return models.MachineUsageOut(
             process=room.process,
             machine=room.machine.name,
@@ -112,10 +119,10 @@ class UsageViews:
             promised_slots=room.slots,
             cores=room.machine.cores,
             promised_cores=round(room.cpu, 4),
-            cpu=round(sum(history.rates.cpu for history in histories), 3),
+            cpu=round(cpu, 3),
             memory=room.machine.memory,
             promised_memory=room.memory,
-            memory_used=sum(history.now.usage.memory for history in histories),
+            memory_used=memory,
             advice=_shown(advice.for_machine(room, others)),
         )
 

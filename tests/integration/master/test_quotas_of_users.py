@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import aiohttp
+import pytest
 from integration.master.conftest import SECRET
 from support.cloud import robot_task_set
 from support.fuzzing import Tracebacks
@@ -15,13 +16,12 @@ from support.fuzzing import Tracebacks
 from rce.control.messages import ClientReply, LogChunk, ReadLog, ToTaskSet
 from rce_client.connection import Connection
 from rce_master.auth import client_digest
-from rce_master.http import api_stream
+from rce_master.http import api_stream, paging
 from rce_master.quotas import QuotaSettings
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
-    import pytest
     from integration.master.conftest import RunSite, Site, TaskSet
 
 
@@ -113,6 +113,38 @@ async def test_streams(run_site: RunSite) -> None:
         async with asyncio.timeout(60):
             while (await follow(anna, "/usage/live")).status != 200:
                 await asyncio.sleep(0.5)
+
+
+@pytest.mark.parametrize("path", ["/interfaces", "/interfaces?limit=5", "/usage"])
+async def test_lists_are_made_one_at_a_time(
+    run_site: RunSite, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """The first list of one user takes long: their others wait for it, and another user's do not."""
+    begun, gate = 0, asyncio.Event()
+
+    def hold(make: Callable[..., Awaitable[object]]) -> Callable[..., Awaitable[object]]:
+        async def held(*args: object) -> object:
+            nonlocal begun
+            begun += 1
+            if begun == 1:
+                await gate.wait()
+            return await make(*args)
+
+        return held
+
+    for name in ("_whole", "_page"):
+        monkeypatch.setattr(paging, name, hold(getattr(paging, name)))
+    async with two_users(run_site) as (site, anna, bert), asyncio.timeout(60):
+        waiting = [asyncio.create_task(ask(site, anna, path)) for _ in range(8)]
+        while begun < 1:
+            await asyncio.sleep(0.01)
+        for _ in range(5):
+            assert (await ask(site, bert, path))[0] == 200
+        assert begun == 6
+        assert not any(task.done() for task in waiting)
+        gate.set()
+        assert {status for status, _ in await asyncio.gather(*waiting)} == {200}
+        assert begun == 5 + 8
 
 
 async def test_reads_of_logs(run_site: RunSite) -> None:
