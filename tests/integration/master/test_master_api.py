@@ -238,7 +238,7 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
 
 
 async def test_events_after_a_greater_id_begin_with_a_gap(site: Site) -> None:
-    """A follower has an id of the time when the engine's store was etcd; a stream and pages tell it the same."""
+    """A follower has an id of the time when the store was etcd; a stream and pages tell it the same."""
     await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
     everything = await read_events(site, 2, site.token, since=0)
     former = 10_010_000_000_007
