@@ -70,7 +70,7 @@ async def _push(folder: Path, version: str, *, every: bool, dry_run: bool) -> No
 async def _send(client: ApiClient, login: Credentials, source: Source, archive: BinaryIO) -> Any:
     name, version = source.contents.name, source.version
     key, _ = signing_key.load_or_make()
-    known = (await client.call("GET", "/package-keys"))["keys"]
+    known = await client.items("/package-keys", "keys")
     if all(one["key"] != key.public for one in known):
         if known:
             raise CliError(
@@ -115,7 +115,7 @@ def list_(user: OfUser = "") -> None:
 
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("GET", "/packages", query=_of(user)))["packages"]
+        found = await client.items("/packages", query=_of(user))
     table = Table("package", "version", "size", "pushed", "used by", box=None)
     for one in found:
         version = one["version"] + (" (newest)" if one["newest"] else "")
@@ -137,7 +137,7 @@ def show(
 async def _show(name: str, version: str, user: str) -> None:
     login = credentials.load()
     async with ApiClient.of(login) as client:
-        found = (await client.call("GET", "/packages", query=_of(user or login.user)))["packages"]
+        found = await client.items("/packages", query=_of(user or login.user))
     fitting = [one for one in found if one["name"] == name]
     fitting = [one for one in fitting if (one["version"] == version if version else one["newest"])]
     if not fitting:
@@ -184,7 +184,7 @@ def show_keys(context: typer.Context) -> None:
 
 async def _show_keys() -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("GET", "/package-keys"))["keys"]
+        found = await client.items("/package-keys", "keys")
     own = signing_key.load()
     table = Table("key", "label", "since", "", box=None)
     for one in found:
@@ -218,7 +218,7 @@ def revoke_key(key: Annotated[str, typer.Argument(help="Its id, as `rce package 
 async def _revoke_key(id_: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         await client.call("DELETE", f"/package-keys/{id_}")
-        found = (await client.call("GET", "/packages", query=_of(credentials.load().user)))["packages"]
+        found = await client.items("/packages", query=_of(credentials.load().user))
     typer.echo(f"revoked {id_}")
     signed = [f"{one['name']}@{one['version']}" for one in found if one["key"] == id_]
     if signed:

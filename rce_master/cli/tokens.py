@@ -96,9 +96,9 @@ def revoke_robots(
 
 async def _list(path: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("GET", path, query=_of(user)))["tokens"]
+        found = await client.items(path, "tokens", _of(user))
     table = Table("id", "for", "label", "since", "expires", "last used", box=None)
-    for each in found:
+    for each in sorted(found, key=lambda one: float(one["created"])):
         table.add_row(
             each["id"],
             each["scope"] or ("this login" if each["current"] else "login"),

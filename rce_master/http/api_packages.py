@@ -10,6 +10,7 @@ from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
+from rce_master.http.paging import ALONE, PAGE, Listing, Span, answer, keys_of_users
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.packages.service import PushRequest
 from rce_master.state import commands
@@ -19,6 +20,8 @@ from rce_master.state.user_records import PackageKey, UserPackage, user_package_
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from aiohttp import web
+
     from rce_master.state.tables import Tables
 
 routes = route_table("packages")
@@ -26,23 +29,34 @@ routes = route_table("packages")
 _QUERY = (OF_USER,)
 
 
-@routes.route("GET", "/packages", "List packages that users brought", reply=models.PackagesOut, query=_QUERY)
-async def list_packages(call: Call) -> models.PackagesOut:
+@routes.route(
+    "GET",
+    "/packages",
+    "List packages that users brought",
+    reply=models.PackagesOut,
+    query=(*_QUERY, *PAGE),
+)
+async def list_packages(call: Call) -> web.Response:
     """List all versions of all packages."""
-    tables = call.services.state_service.tables
-    scope = call.scope
-    found = tables.packages if scope is None else tables.packages.by("user", scope)
-    users = {package.user for package in found}
-    used = {id_: nodes for user in users for id_, nodes in uses(tables, user).items()}
+    tables, scope = call.services.state_service.tables, call.scope
+    used = cache(lambda user: uses(tables, user))
     newest = cache(lambda user, name: find(tables, user, name))
-    return models.PackagesOut(
-        packages=[
-            _package_out(
-                package, is_newest=newest(package.user, package.name) == package, nodes=used.get(package.id)
-            )
-            for package in sorted(found, key=lambda package: package.id)
-        ]
-    )
+
+    def whole() -> list[str]:
+        return sorted(
+            one.id for one in (tables.packages if scope is None else tables.packages.by("user", scope))
+        )
+
+    def items(key: str, span: Span) -> list[tuple[str, models.PackageOut]]:
+        one = tables.packages.get(key)
+        if one is None:
+            return []
+        is_newest = newest(one.user, one.name) == one
+        shown = _package_out(one, is_newest=is_newest, nodes=used(one.user).get(one.id))
+        return [(name, shown) for name in span.of(ALONE)]
+
+    keys = keys_of_users(tables, tables.packages, "user", scope)
+    return await answer(call, Listing(name="packages", whole=whole, keys=keys, items=items))
 
 
 @routes.route("GET", "/packages/{name}/{version}", "Show a package", reply=models.PackageOut, query=_QUERY)
@@ -101,12 +115,27 @@ async def remove_package(call: Call) -> None:
 
 
 @routes.route(
-    "GET", "/package-keys", "List the keys that sign packages", reply=models.PackageKeysOut, query=_QUERY
+    "GET",
+    "/package-keys",
+    "List the keys that sign packages",
+    reply=models.PackageKeysOut,
+    query=(*_QUERY, *PAGE),
 )
-async def list_package_keys(call: Call) -> models.PackageKeysOut:
+async def list_package_keys(call: Call) -> web.Response:
     """List a user's keys."""
-    found = call.services.state_service.tables.package_keys.by("user", call.owner)
-    return models.PackageKeysOut(keys=[_key_out(key) for key in found])
+    tables, owner = call.services.state_service.tables, call.owner
+
+    def items(key: str, span: Span) -> list[tuple[str, models.PackageKeyOut]]:
+        found = tables.package_keys.get(key)
+        return [] if found is None else [(name, _key_out(found)) for name in span.of(ALONE)]
+
+    listing = Listing(
+        name="keys",
+        whole=lambda: list(tables.package_keys.keys("user", owner)),
+        keys=keys_of_users(tables, tables.package_keys, "user", owner),
+        items=items,
+    )
+    return await answer(call, listing)
 
 
 @routes.route(

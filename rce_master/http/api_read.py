@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from rce_master.http import models, spec_models
-from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of, keys_of_users
+from rce_master.http.paging import ALONE, PAGE, Listing, Span, answer, keys_of, keys_of_users
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 
@@ -23,8 +23,6 @@ routes = route_table("fleet")
 
 _QUERY = (OF_USER, *PAGE)
 Items = Iterable[tuple[str, "Model"]]
-_ALONE = ("",)
-"""The name of the only item of a key."""
 
 
 @routes.route("GET", "/robots", "List robots", reply=models.RobotsOut, query=_QUERY)
@@ -34,7 +32,7 @@ async def list_robots(call: Call) -> web.Response:
 
     def items(key: str, span: Span) -> Items:
         robot = tables.robot(key)
-        return [] if robot is None else [(name, views.robot(robot)) for name in span.of(_ALONE)]
+        return [] if robot is None else [(name, views.robot(robot)) for name in span.of(ALONE)]
 
     listing = Listing(
         name="robots",
@@ -52,7 +50,7 @@ async def list_containers(call: Call) -> web.Response:
 
     def items(key: str, span: Span) -> Items:
         container = tables.container(key)
-        return [] if container is None else [(name, views.container(container)) for name in span.of(_ALONE)]
+        return [] if container is None else [(name, views.container(container)) for name in span.of(ALONE)]
 
     return await _of_containers(call, "containers", items)
 
@@ -121,7 +119,7 @@ async def list_machines(call: Call) -> web.Response:
 
     def items(key: str, span: Span) -> Items:
         task_set = tables.task_sets.get(key)
-        return [] if task_set is None else [(name, views.machine(task_set)) for name in span.of(_ALONE)]
+        return [] if task_set is None else [(name, views.machine(task_set)) for name in span.of(ALONE)]
 
     listing = Listing(
         name="machines",

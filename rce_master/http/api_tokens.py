@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from heapq import nsmallest
+from typing import TYPE_CHECKING
+
 from rce.model import is_name
 from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
+from rce_master.http.paging import ALONE, PAGE, Listing, Span, answer
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.state import commands
 from rce_master.state.user_records import METRICS_SCOPE, ROBOT_SCOPE, Token
 from rce_master.tokens import new_token, token_digest
+
+if TYPE_CHECKING:
+    from aiohttp import web
 
 routes = route_table("tokens")
 
 _DAY_S = 24 * 3600.0
 
 
-@routes.route("GET", "/tokens", "List a user's tokens", reply=models.TokensOut, query=(OF_USER,))
-async def list_tokens(call: Call) -> models.TokensOut:
+_QUERY = (OF_USER, *PAGE)
+
+
+@routes.route("GET", "/tokens", "List a user's tokens", reply=models.TokensOut, query=_QUERY)
+async def list_tokens(call: Call) -> web.Response:
     """List tokens, without their secrets."""
-    return models.TokensOut(tokens=[_show(call, token) for token in _of(call)])
+    return await _answer(call, _of(call))
 
 
 @routes.route(
@@ -56,11 +66,11 @@ async def revoke_token(call: Call) -> None:
 
 
 @routes.route(
-    "GET", "/robot-tokens", "List the tokens of a user's robots", reply=models.TokensOut, query=(OF_USER,)
+    "GET", "/robot-tokens", "List the tokens of a user's robots", reply=models.TokensOut, query=_QUERY
 )
-async def list_robot_tokens(call: Call) -> models.TokensOut:
+async def list_robot_tokens(call: Call) -> web.Response:
     """List the robots that have a token."""
-    return models.TokensOut(tokens=[_show(call, token) for token in _of(call) if token.robot])
+    return await _answer(call, [token for token in _of(call) if token.robot])
 
 
 @routes.route(
@@ -110,6 +120,20 @@ async def _make(
     )
     await call.submit(commands.AddToken(token=record, replaces=replaces), reply)
     return reply
+
+
+async def _answer(call: Call, found: list[Token]) -> web.Response:
+    """List tokens: whole in the order in which they were made, pages in that of their ids."""
+    tokens = {token.id: token for token in found}
+
+    def keys(start: str, most: int) -> list[str]:
+        return nsmallest(most, (id_ for id_ in tokens if id_ >= start))
+
+    def items(key: str, span: Span) -> list[tuple[str, models.TokenListed]]:
+        token = tokens.get(key)
+        return [] if token is None else [(name, _show(call, token)) for name in span.of(ALONE)]
+
+    return await answer(call, Listing(name="tokens", whole=lambda: list(tokens), keys=keys, items=items))
 
 
 def _of(call: Call) -> list[Token]:

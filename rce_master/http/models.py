@@ -173,7 +173,7 @@ class AuditOut(Model):
     """Why records of other masters may be missing, one text for each of those; empty if none are."""
 
 
-class TokensOut(Model):
+class TokensOut(Page):
     """Tokens."""
 
     tokens: list[TokenListed]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from rce_master.http.model import Model
+from rce_master.http.model import Model, Page
 
 
 class PackageKeyIn(Model):
@@ -29,7 +29,7 @@ class PackageKeyOut(Model):
     """Seconds since 1970."""
 
 
-class PackageKeysOut(Model):
+class PackageKeysOut(Page):
     """A user's keys."""
 
     keys: list[PackageKeyOut]
@@ -67,7 +67,7 @@ class PackageOut(Model):
     """Warnings for its owner; only in the answer to a push."""
 
 
-class PackagesOut(Model):
+class PackagesOut(Page):
     """All versions of all packages."""
 
     packages: list[PackageOut]

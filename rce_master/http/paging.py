@@ -48,6 +48,10 @@ PAGE = (
 """The query parameters of lists."""
 
 
+ALONE = ("",)
+"""The name of the only item of a key."""
+
+
 class Span(NamedTuple):
     """Which names of a key's items to take."""
 

@@ -104,6 +104,10 @@ async def test_a_version_never_changes(shop: Site, tmp_path: Path) -> None:
     await push(package, version="1.1")
     listed = (await shop.api("GET", "/packages"))["packages"]
     assert [(one["version"], one["newest"]) for one in listed] == [("1.0", False), ("1.1", True)]
+    first = await shop.api("GET", "/packages", limit=1)
+    second = await shop.api("GET", "/packages", limit=1, cursor=first["next"])
+    assert [*first["packages"], *second["packages"]] == listed
+    assert second["next"] is None
     assert len(stored(tmp_path)) == 2
 
 

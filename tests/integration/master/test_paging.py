@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rce.packages.signing import SigningKey
 from rce_master.cli.client import ApiClient
 from rce_master.cli.show import fetch
 
@@ -38,8 +39,8 @@ async def filled(site: Site) -> Site:
     return site
 
 
-async def pages(site: Site, path: str, limit: int) -> list[list[dict[str, Any]]]:
-    name = path.partition("?")[0].strip("/")
+async def pages(site: Site, path: str, limit: int, name: str = "") -> list[list[dict[str, Any]]]:
+    name = name or path.partition("?")[0].strip("/")
     found, cursor = [], ""
     while True:
         mark = "&" if "?" in path else "?"
@@ -54,6 +55,25 @@ async def pages(site: Site, path: str, limit: int) -> list[list[dict[str, Any]]]
 
 def sorted_(items: list[dict[str, Any]]) -> list[str]:
     return sorted(json.dumps(item, sort_keys=True) for item in items)
+
+
+@pytest.mark.parametrize("limit", [1, 3, 1000])
+async def test_tokens_and_keys_have_pages(site: Site, limit: int) -> None:
+    for number in range(7):
+        await site.api("POST", "/robot-tokens", {"robot": f"r{number}"}, status=201)
+        await site.api("POST", "/package-keys", {"key": SigningKey.generate().public}, status=201)
+    for path, name, count in (
+        ("/tokens", "tokens", 8),
+        ("/robot-tokens", "tokens", 7),
+        ("/package-keys", "keys", 7),
+    ):
+        whole = await site.api("GET", path)
+        assert whole["next"] is None
+        assert len(whole[name]) == count
+        found = [item for page in await pages(site, path, limit, name) for item in page]
+        assert sorted(one["id"] for one in found) == sorted(one["id"] for one in whole[name])
+    created = [token["created"] for token in (await site.api("GET", "/tokens"))["tokens"]]
+    assert created == sorted(created)
 
 
 @pytest.mark.parametrize("limit", [1, 3, 1000])
