@@ -54,7 +54,7 @@ collect: install
 
 fuzz: install
 	RCE_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) $(BIN)/python -m pytest --timeout 3600 \
-		$(wildcard tests/integration/*/test_*_fuzz.py tests/integration/*/test_openapi.py) $(ARGS)
+		$(wildcard tests/integration/*/test_*_fuzz.py tests/integration/*/test_*openapi.py) $(ARGS)
 
 faults: install
 	PYTHONPATH=tests $(BIN)/python -m faults $(ARGS)

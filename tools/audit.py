@@ -14,7 +14,11 @@ from typing import Any
 
 LOCK = Path(__file__).resolve().parent.parent / "requirements.lock"
 TIMEOUT_S = 300
-_AWAY = ("connect", "timed out", "timeout", "resolve", "max retries", "serviceerror", "proxy")
+_AWAY = (
+    *("connectionerror", "connecttimeout", "readtimeout", "proxyerror", "serviceerror"),
+    *("connection refused", "connection reset", "failed to resolve", "name resolution", "timed out"),
+)
+"""What errors of an unreachable database contain, in lower case."""
 
 
 def main(arguments: list[str]) -> int:

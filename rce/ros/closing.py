@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterable
+from collections.abc import Coroutine, Iterable, Iterator
 from typing import Any, Generic, Protocol, TypeVar
 
 from rce.aio.tasks import cancel_and_wait
@@ -31,25 +31,33 @@ C = TypeVar("C", bound=Closable)
 
 
 class OpenConnections(Generic[C]):
-    """The open connections of one server."""
+    """The open connections of one server, in the order of their last use."""
 
     def __init__(self) -> None:
-        self._connections: set[C] = set()
+        self._connections: dict[C, None] = {}
         self._closed = False
 
     def __len__(self) -> int:
         return len(self._connections)
+
+    def __iter__(self) -> Iterator[C]:
+        return iter(self._connections)
 
     def add(self, connection: C) -> None:
         """Note an open connection; abort it if the server closed while the connection was accepted."""
         if self._closed:
             connection.abort()
         else:
-            self._connections.add(connection)
+            self._connections[connection] = None
+
+    def use(self, connection: C) -> None:
+        """Note that an open connection was used."""
+        if self._connections.pop(connection, self) is None:
+            self._connections[connection] = None
 
     def discard(self, connection: C) -> None:
         """Forget a connection whose socket is closed."""
-        self._connections.discard(connection)
+        self._connections.pop(connection, None)
 
     async def close(self) -> None:
         """Close all and wait until their sockets are closed; abort those that take too long."""

@@ -225,7 +225,7 @@ def installed_shares() -> list[Path]:
 
 def _find_below(root: Path, name: str) -> Path | None:
     """Return the folder of a package that is on or below one folder of the path."""
-    if root.name == "share":
+    if root.name == "share" and (root.parent / "lib").is_dir():
         return _installed(root, name)
     found = _tree(root).packages().get(name)
     if found is not None:

@@ -26,6 +26,7 @@ MAX_BODY = 16 * 2**20
 """Longest request in bytes."""
 
 MAX_CONNECTIONS = 4096
+"""Open connections; for one more, that which was not used for the longest time is closed."""
 REQUEST_TIMEOUT = 30.0
 """Seconds from a request's first byte to its last."""
 
@@ -82,12 +83,21 @@ class _Connection(asyncio.Protocol):
         self._deadline: asyncio.TimerHandle | None = None
         self._full = False
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether no request is being received and all answers have been taken."""
+        return self._deadline is None and not self._full
+
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
         if len(self._siblings) >= MAX_CONNECTIONS:
-            _log.warning("more than %d connections: one is turned away", MAX_CONNECTIONS)
-            self._transport.abort()
-            return
+            unused = next((one for one in self._siblings if one.is_idle), self)
+            _log.warning("more than %d connections: one of them is closed", MAX_CONNECTIONS)
+            if unused is self:
+                self._transport.abort()
+                return
+            self._siblings.discard(unused)
+            unused.abort()
         set_keepalive(transport.get_extra_info("socket"), idle=60, interval=10, count=9)
         self._siblings.add(self)
 
@@ -163,6 +173,7 @@ class _Connection(asyncio.Protocol):
     def _answer(self) -> None:
         document = self._dispatcher.respond(b"".join(self._body))
         self._finish_request()
+        self._siblings.use(self)
         self._respond(200, b"text/xml", document)
         if self._http.our_state is h11.MUST_CLOSE:
             self.close()

@@ -57,6 +57,16 @@ def test_packages_of_a_workspace_are_found_in_depth(tmp_path: Path) -> None:
     assert PackageIndex([tmp_path]).find("deep").path == deep
 
 
+def test_a_users_folder_named_share_is_searched_in_depth(tmp_path: Path) -> None:
+    """Only that of a distribution, with ``lib`` beside it, has its packages at the first level."""
+    deep = package(tmp_path / "share" / "repository" / "deep")
+    index = PackageIndex([tmp_path / "share"])
+    assert index.find("deep").path == deep
+    (tmp_path / "lib").mkdir()
+    with pytest.raises(PackageNotFoundError):
+        PackageIndex([tmp_path / "share"]).find("deep")
+
+
 def test_the_search_stops_at_a_package(tmp_path: Path) -> None:
     outer = package(tmp_path / "outer")
     package(outer / "inner")
