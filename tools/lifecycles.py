@@ -78,8 +78,8 @@ CYCLES = (
     Cycle(
         "Master among several",
         "leadership",
-        "What `GET /healthz` of a master shows as its role, with a store in etcd"
-        " ([three masters](../how-to/three-masters.md)).",
+        "With a store in etcd ([three masters](../how-to/three-masters.md)). `GET /healthz` shows the role"
+        " `leader` while a master is leading, and `standby` in the other states.",
         rce_master.leadership.core.LEADERSHIP_LIFE,
     ),
     Cycle(

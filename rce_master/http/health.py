@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
-from aiohttp import web
+from aiohttp import hdrs, web
 
 from rce import __version__
 from rce_master.exceptions import StoreError
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 HEALTH_PATH: Final = "/healthz"
+AGAIN: Final[dict[str, str]] = {hdrs.RETRY_AFTER: "1"}
+"""Headers of a stand-by's answer: whether it leads may change within a second."""
 
 
 class Health:
@@ -43,7 +45,7 @@ class Health:
             self._look = asyncio.create_task(self._check())
         fault = await asyncio.shield(self._look)
         if self._fence is not None and self._fence.is_closed:
-            return web.json_response(self._fenced(self._fence), status=503)
+            return web.json_response(self._fenced(self._fence), status=503, headers=AGAIN)
         tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
         body: dict[str, object] = {"status": fault or "ok", "task_sets": connected}

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from aiohttp import hdrs, web
+from aiohttp import web
 
 from rce.web.origin import ServerNames
 from rce_master.http.forward import NotForwardedError
-from rce_master.http.health import HEALTH_PATH, describe_role
+from rce_master.http.health import AGAIN, HEALTH_PATH, describe_role
 from rce_master.http.origin_guard import origin_guard
 from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
@@ -74,7 +74,7 @@ class _Standby:
             "lag": round(self._follower.seconds_behind, 3),
             "lag_revisions": self._follower.lag.revisions,
         }
-        return web.json_response(body, status=503)
+        return web.json_response(body, status=503, headers=AGAIN)
 
     async def metrics(self, _: web.Request) -> web.Response:
         """Tell what ``/healthz`` tells everyone: a stand-by has no users, so no tokens."""
@@ -86,7 +86,7 @@ class _Standby:
             return await self._forwarder.forward(request, self._keeper.leader)
         except NotForwardedError as error:
             text = f"this master is a stand-by; {self._keeper.fault or error}"
-            headers = {hdrs.RETRY_AFTER: "1", STANDBY_HEADER: "yes"}
+            headers = {**AGAIN, STANDBY_HEADER: "yes"}
             if self._keeper.leader is not None and self._keeper.leader.url:
                 headers[LEADER_HEADER] = self._keeper.leader.url
             return web.json_response({"error": text}, status=503, headers=headers)

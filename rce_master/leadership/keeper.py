@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from rce_master.exceptions import FencedError, StoreBusyError, StoreError
 from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings, Role
+from rce_master.store.etcd.exceptions import with_remedy
 from rce_master.store.etcd.store import Candidacy, EtcdStore
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class LeadershipKeeper:
         try:
             seen = await self._watched.leadership()
         except StoreError as error:
-            self._note(str(error))
+            self._note(with_remedy(error))
             return self.core.looked(is_led=None, is_drained=self.is_drained, now=self._clock())
         self._note("")
         self.leader, self.is_drained = seen.leader, self._name in seen.drained
@@ -127,7 +128,7 @@ class LeadershipKeeper:
         try:
             self.lease, ttl = await self._client.grant(math.ceil(self.core.settings.ttl))
         except StoreError as error:
-            self._note(str(error))
+            self._note(with_remedy(error))
             return False
         self.core.granted(sent, ttl)
         candidacy = Candidacy(self.lease, self._name, self._remaining, self.url)

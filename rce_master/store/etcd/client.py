@@ -15,7 +15,7 @@ import aiohttp
 from rce.tls import explain_to_client
 from rce_master.exceptions import StoreError
 from rce_master.store.etcd import wire
-from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError, NoQuorumError
+from rce_master.store.etcd.exceptions import QUORUM, EtcdAwayError, EtcdRefusedError, NoQuorumError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
@@ -174,10 +174,7 @@ class EtcdClient:
         try:
             await self.get("/")
         except EtcdAwayError as error:
-            raise NoQuorumError(
-                f"etcd has no quorum: more than half of its members must run and reach each other ({error})."
-                " If they are lost for good, restore a backup to a new etcd: rce restore, or etcdctl snapshot"
-            ) from error
+            raise NoQuorumError(f"etcd has no quorum ({error}): {QUORUM}") from error
 
     async def _check_version(self, endpoint: str) -> None:
         body = await self._exchange(endpoint, "version", None, self._attempt)

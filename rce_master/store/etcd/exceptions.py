@@ -32,6 +32,18 @@ _HINTS = {
 _CERTIFICATE_HINT = "etcd asks for a login or a certificate that this master does not have"
 
 
+QUORUM = (
+    "more than half of the members of etcd must run and reach each other, which 'rce cluster status' shows;"
+    " if they are lost for good: rce cluster recover (docs/how-to/cluster.md), or restore a backup to a new"
+    " etcd"
+)
+
+
+def with_remedy(error: StoreError) -> str:
+    """Return the text of an error; if etcd does not answer, with what the operator can do."""
+    return f"{error}; {QUORUM}" if isinstance(error, EtcdAwayError) else str(error)
+
+
 class EtcdError(StoreError):
     """A request to etcd failed."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError, StoreError
-from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError
+from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError, with_remedy
 from rce_master.store.etcd.layout import (
     Keys,
     LeadershipView,
@@ -279,7 +279,11 @@ class EtcdStore:
         Raises:
             StoreError: It does not.
         """
-        if await self._client.get(self._keys.schema) is None:
+        try:
+            found = await self._client.get(self._keys.schema)
+        except EtcdAwayError as error:
+            raise StoreError(with_remedy(error)) from error
+        if found is None:
             raise StoreError(f"the state below {self._keys.root} was removed from etcd")
 
     async def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import signal
 import socket
@@ -19,6 +20,7 @@ from support.ports import free_port
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity
 from rce_master.exceptions import StoreError
+from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore
 from rce_master.store.etcd.exceptions import EtcdAwayError
@@ -123,10 +125,27 @@ async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
         second = await etcd.leader_of([member for member in etcd.members if member is not first])
         second.send(signal.SIGSTOP)
         (third,) = [member for member in etcd.members if member not in (first, second)]
-        assert "etcd has no quorum" in await refusal(third.endpoint)
+        text = await refusal(third.endpoint)
+        assert "etcd has no quorum" in text
+        assert "rce cluster recover" in text
+        await check_runtime_faults(client)
         second.send(signal.SIGCONT)
         await store.save([Row("users", "b", b"2")])
         assert await store.load() == {"users": {"a": b"1", "b": b"2"}}
+
+
+async def check_runtime_faults(client: EtcdClient) -> None:
+    """What a leader and a stand-by show at ``/healthz`` names what to do when etcd has no quorum."""
+    with pytest.raises(StoreError, match=r"more than half of the members.*rce cluster recover"):
+        await EtcdStore(client, "/rce").check()
+    keeper = LeadershipKeeper(client, "/rce", "one:9000")
+    waiting = asyncio.create_task(keeper.acquire())
+    try:
+        await until(lambda: keeper.fault, timeout=60, what="the stand-by knows that etcd does not answer")
+    finally:
+        waiting.cancel()
+        await asyncio.wait([waiting])
+    assert "rce cluster recover" in keeper.fault
 
 
 @pytest.mark.needs("etcd")

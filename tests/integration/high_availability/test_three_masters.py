@@ -66,6 +66,8 @@ async def test_one_leads_and_the_others_say_who(shared_masters: Masters) -> None
     assert found["leader"] == f"{leader.name}:{leader.http_port}"
     async with shared_masters.session(20.0) as session:
         for other in (master for master in shared_masters.all if master is not leader):
+            async with session.get(f"{other.url}healthz") as reply:
+                assert (reply.status, reply.headers["Retry-After"]) == (503, "1")
             async with session.get(f"{other.url}metrics") as reply:
                 told = await reply.text()
             assert "rce_master_leading 0.0" in told
