@@ -61,8 +61,11 @@ _NAMES = ("container", "endpoint", "tag", "name", "tag_a", "tag_b")
 DONE, REFUSED = "done", "refused"
 
 
-_Key: TypeAlias = tuple[str, str, str, str]
-"""User, action, address and outcome."""
+STATION = "station"
+"""The ``via`` of what the user themselves, or a station in their name, told: only the user is checked."""
+
+_Key: TypeAlias = tuple[str, str, str, str, str]
+"""User, action, address and outcome, and :data:`STATION` if it was told."""
 
 
 class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -82,9 +85,11 @@ class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """``done`` or ``refused``."""
     detail: str = ""
     address: str = ""
-    """The address it came from."""
+    """The address from which the master got it."""
     via: str = ""
-    """The robot or station that passed it on."""
+    """The robot that passed it on, or :data:`STATION`."""
+    client: str = ""
+    """The address of the station's client, as the station told it: not checked."""
     times: int = 1
     """How often since the previous record of the same user, action, address and outcome."""
 
@@ -133,6 +138,7 @@ class AuditLog:
         detail: str = "",
         address: str = "",
         via: str = "",
+        client: str = "",
         outcome: str = DONE,
         times: int = 1,
     ) -> None:
@@ -143,8 +149,8 @@ class AuditLog:
         """
         now = self._clock()
         address = _clean(address)
-        if self._is_too_much(user, outcome, now):
-            self._count_more((user, action, address, outcome), now, times)
+        if self._is_too_much(user, outcome + _told(via), now):
+            self._count_more((user, action, address, outcome, _told(via)), now, times)
             return
         self._add(
             user,
@@ -154,6 +160,7 @@ class AuditLog:
             detail=_clean(detail),
             address=address,
             via=_clean(via),
+            client=_clean(client),
             outcome=outcome,
             times=times,
         )
@@ -168,7 +175,7 @@ class AuditLog:
         """Record a refusal; repetitions are counted and written at most once a minute."""
         now = self._clock()
         address = _clean(address)
-        key = user, action, address, REFUSED
+        key = user, action, address, REFUSED, ""
         times = self._count(key, now)
         if not times:
             return
@@ -179,17 +186,18 @@ class AuditLog:
             detail = _clean(detail)
             self._add(user, action, now, detail=detail, address=address, outcome=REFUSED, times=times)
 
-    def _is_too_much(self, user: str, outcome: str, now: float) -> bool:
-        # Not one limit for both: others can cause refusals of a user, by wrong passwords.
-        return bool(self._rates.take(f"{outcome} {user}", now))
+    def _is_too_much(self, user: str, kind: str, now: float) -> bool:
+        # Not one limit for all: others can cause refusals of a user by wrong passwords, and what a user tells
+        # must not hide what they do.
+        return bool(self._rates.take(f"{kind} {user}", now))
 
     def _count_more(self, key: _Key, now: float, times: int) -> None:
         """Count what is too much to be written one by one."""
-        user, _, _, outcome = key
+        user, _, _, outcome, told = key
         if key not in self._repeated:
-            kinds = sum(1 for one in self._repeated if (one[0], one[3]) == (user, outcome))
+            kinds = sum(1 for one in self._repeated if (one[0], one[3], one[4]) == (user, outcome, told))
             if kinds >= MAX_KINDS:
-                key = user, OTHER_ACTIONS, "", outcome
+                key = user, OTHER_ACTIONS, "", outcome, told
         self._add_missed(key, self._count(key, now, times))
 
     def _count(self, key: _Key, now: float, times: int = 1) -> int:
@@ -223,12 +231,19 @@ class AuditLog:
         self._close()
 
     def _add_missed(self, key: _Key, count: int) -> None:
-        user, action, address, outcome = key
+        user, action, address, outcome, told = key
         if count:
             is_known = outcome == REFUSED and action != OTHER_ACTIONS
             detail = "again" if is_known else "too often to be listed"
             self._add(
-                user, action, self._clock(), detail=detail, address=address, outcome=outcome, times=count
+                user,
+                action,
+                self._clock(),
+                detail=detail,
+                address=address,
+                via=told,
+                outcome=outcome,
+                times=count,
             )
 
     def _write(self, line: bytes) -> None:
@@ -300,6 +315,10 @@ def newest(folder: Path, files: int = FILES) -> list[Record]:
 
 def _numbered(folder: Path, number: int) -> Path:
     return folder / f"{FILE_NAME}.{number}" if number else folder / FILE_NAME
+
+
+def _told(via: str) -> str:
+    return STATION if via == STATION else ""
 
 
 def _clean(text: str) -> str:

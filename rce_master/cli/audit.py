@@ -57,5 +57,9 @@ def _line(record: dict[str, Any]) -> str:
         words.append(f"({record['detail']})")
     if record["times"] > 1:
         words.append(f"{record['times']} times")
-    words += [f"{name} {record[key]}" for name, key in (("from", "address"), ("by", "via")) if record[key]]
+    words += [
+        f"{name} {record[key]}"
+        for name, key in (("from", "address"), ("by", "via"), ("for", "client"))
+        if record.get(key)
+    ]
     return one_line("  ".join(word for word in words if word))

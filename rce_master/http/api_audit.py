@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import asdict
 
 from rce.web.openapi import Query
-from rce_master.audit import choose
+from rce_master.audit import STATION, choose
 from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
 from rce_master.http.routes import Call, route_table
@@ -60,7 +60,11 @@ async def read_audit(call: Call) -> models.AuditOut:
     stations=True,
 )
 async def note_action(call: Call) -> None:
-    """Record a control action; a station sends it with the token of the acting user."""
+    """Record a control action; a station sends it with the token of the acting user.
+
+    Anybody may do so for themselves. So nothing of it is believed but the user: it is marked as told, and has the
+    address from which it came beside the one that is told.
+    """
     body = call.read(models.AuditIn)
     if call.caller.role is UserRole.VIEWER and body.outcome == "done":
         raise ForbiddenError("role viewer steers nothing, so there is nothing to note")
@@ -69,7 +73,8 @@ async def note_action(call: Call) -> None:
         body.action,
         body.subject,
         detail=body.detail,
-        address=body.address or call.address,
-        via="station",
+        address=call.address,
+        via=STATION,
+        client=body.address,
         outcome=body.outcome,
     )

@@ -81,7 +81,7 @@ class AuditIn(Body):
     subject: Annotated[str, Field(max_length=300)] = ""
     detail: Annotated[str, Field(max_length=300)] = ""
     address: Annotated[str, Field(max_length=64)] = ""
-    """The address of the client."""
+    """The address of the client, which is recorded as told."""
     outcome: Annotated[str, Field(pattern="^(done|refused)$")] = "done"
 
 
@@ -159,8 +159,12 @@ class AuditRecord(Model):
     """``done`` or ``refused``."""
     detail: str
     address: str
+    """The address from which the master got it."""
     via: str
-    """The robot or station that passed the action on; empty if none did."""
+    """The robot that passed the action on; ``station``: the user, or a station in their name, told it, and
+    only the user was checked. Empty: the master did it itself."""
+    client: str
+    """The address of the station's client, as the station told it: not checked."""
     times: int
     """Number of times, for repeated refusals."""
 

@@ -71,7 +71,7 @@ async def test_audit_tells_who_did_what_without_secrets(run_site: RunSite, tmp_p
         await site.api("POST", "/containers", {"tag": "c"}, token=tokens["viewer"], status=403)
         robot = await site.api("POST", "/robot-tokens", {"robot": "R1"}, token=tokens["user"], status=201)
         await site.api("DELETE", f"/tokens/{tokens['admin']}", token=tokens["user"], status=404)
-        noted = {"action": "set_goal", "subject": "R1", "detail": "cell 7"}
+        noted = {"action": "set_goal", "subject": "R1", "detail": "cell 7", "address": "192.0.2.7"}
         await site.api("POST", "/audit", noted, token=tokens["operator"], status=204)
         async with site.robots() as robots:
             assert (await robots.channel.login("user", "R1", "", token=robot["token"])).status == 200
@@ -96,6 +96,7 @@ async def test_audit_tells_who_did_what_without_secrets(run_site: RunSite, tmp_p
             assert expected in told, told
         (steered,) = [r for r in records if r["action"] == "set_goal"]
         assert (steered["via"], steered["detail"], steered["address"]) == ("station", "cell 7", "127.0.0.1")
+        assert steered["client"] == "192.0.2.7", "it is what the caller told"
         only = (await site.api("GET", "/audit", since=-1000, user="viewer"))["records"]
         assert {r["user"] for r in only} == {"viewer"}
     text = (tmp_path / "audit" / "audit.jsonl").read_text()

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_master.audit import BURST, MAX_KINDS, MAX_TEXT, OTHER_ACTIONS, PER_SECOND, AuditLog, describe
+from rce_master.audit import (
+    BURST,
+    MAX_KINDS,
+    MAX_TEXT,
+    OTHER_ACTIONS,
+    PER_SECOND,
+    STATION,
+    AuditLog,
+    describe,
+)
 from rce_master.state import commands
 
 if TYPE_CHECKING:
@@ -140,6 +149,24 @@ def test_refusals_from_too_many_addresses_are_counted(tmp_path: Path) -> None:
     found = log.since(0, 10_000)
     assert sum(record.times for record in found) == BURST + 5002
     assert len(found) <= BURST + 2 * MAX_KINDS + 5
+
+
+def test_what_is_told_is_marked_and_hides_nothing(tmp_path: Path) -> None:
+    """A user who tells too much is counted apart; also what is combined is marked as told."""
+    clock = Clock()
+    log = AuditLog(tmp_path, clock)
+    for _ in range(BURST + 5):
+        log.add("anna", "add_user", "root", via=STATION, client="192.0.2.7")
+    log.add("anna", "create_container", "anna/c")
+    clock.now += 120.0
+    log.flush()
+    found = log.since(0, 10_000)
+    assert {record.via for record in found if record.action == "add_user"} == {STATION}
+    assert sum(record.times for record in found if record.action == "add_user") == BURST + 5
+    assert {record.client for record in found[:BURST]} == {"192.0.2.7"}
+    (real,) = [record for record in found if record.action == "create_container"]
+    assert (real.subject, real.via) == ("anna/c", "")
+    log.close()
 
 
 def test_records_by_user(tmp_path: Path) -> None:
