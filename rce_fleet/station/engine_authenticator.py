@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import ssl
 import time
@@ -16,9 +15,11 @@ import aiohttp
 from aiohttp import hdrs
 from yarl import URL
 
+from rce.aio.tasks import cancel_and_wait
 from rce.masters import Masters
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
+from rce_fleet.station.action_queue import ActionQueue, ActionRefusedError, EngineAwayError, QueuedAction
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, StationUser
 
 if TYPE_CHECKING:
@@ -35,12 +36,13 @@ OFFLINE_CACHE_S = 30.0
 LIFETIME_S = 12 * 3600.0
 """Lifetime of a login at the page."""
 MAX_CACHED = 1000
-MAX_QUEUED_ACTIONS = 1000
 _PASSED_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
 """Status of the master's answer to a login -> status of the station's; all others become 503."""
 T = TypeVar("T")
 _REQUEST_ERRORS = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
 """Raised by requests to the master, also if another program answers at its address."""
+_ENDED = (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN)
+"""The token is not valid any more, or its user may not do this any more."""
 _UNSENT = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError)
 _NO_ANSWER = (aiohttp.ClientConnectionError, TimeoutError)
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
@@ -88,7 +90,7 @@ class EngineAuthenticator:
         self._masters = Masters(account.url)
         self._allow_anonymous = allow_anonymous
         self._cache: OrderedDict[str, tuple[float, StationUser | None]] = OrderedDict()
-        self._actions: asyncio.Queue[tuple[str, AuditedAction]] = asyncio.Queue(MAX_QUEUED_ACTIONS)
+        self._actions = ActionQueue(self._send_action)
         self._own_token = ""
         self._session: aiohttp.ClientSession
         self._writer: asyncio.Task[None]
@@ -107,14 +109,16 @@ class EngineAuthenticator:
         connector = session_connector(None)
         timeout = _TIMEOUT_OF_SEVERAL if self._masters.has_others else _TIMEOUT
         self._session = aiohttp.ClientSession(timeout=timeout, connector=connector)
-        self._writer = asyncio.create_task(self._send_actions())
+        self._writer = asyncio.create_task(self._actions.run(), name="actions for the audit log")
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Revoke the station's own token and close the session."""
-        self._writer.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._writer
+        """Send what the audit log lacks, revoke the station's own token, and close the session."""
+        try:
+            await self._actions.drain()
+        finally:
+            await cancel_and_wait(self._writer)
+            self._actions.drop()
         if self._own_token:
             await self.log_out(self._own_token)
         await self._session.close()
@@ -190,10 +194,8 @@ class EngineAuthenticator:
 
     def audit(self, token: str, action: AuditedAction) -> None:
         """Queue an action for the engine's audit log. Does not wait."""
-        try:
-            self._actions.put_nowait((token, action))
-        except asyncio.QueueFull:
-            _log.warning("not in the audit log, the queue is full: %s %s", action.name, action.subject)
+        _, known = self._cache.get(token, (0.0, None))
+        self._actions.put(QueuedAction(token, "" if known is None else known.name, action))
 
     async def _in_turn(self, request: Callable[[], Awaitable[T]], *, reads: bool = False) -> T:
         """Make a request at the master in use, and if it does not get it, at the others in turn.
@@ -236,33 +238,71 @@ class EngineAuthenticator:
                 )
             raise AuthenticationError(503, f"the engine refuses logins now: {said}")
 
-    async def _send_actions(self) -> None:
-        while True:
-            token, action = await self._actions.get()
-            try:
-                await self._in_turn(lambda: self._send_action(token, action))  # noqa: B023 - called at once
-            except (*_REQUEST_ERRORS, AuthenticationError) as error:
-                _log.warning("not in the audit log: %s %s: %s", action.name, action.subject, error)
+    async def _send_action(self, queued: QueuedAction) -> None:
+        """Note an action in the engine's audit log; by the station itself if the user's token has ended.
 
-    async def _send_action(self, token: str, action: AuditedAction) -> None:
-        if not token and not self._own_token:
+        Raises:
+            EngineAwayError: The engine does not take it now.
+            ActionRefusedError: The engine never takes it.
+        """
+        detail = queued.action.detail
+        if queued.token:
+            status = await self._post_action(queued.token, queued.action, detail)
+            if status not in _ENDED:
+                return
+            detail = f"by {queued.user or 'a user'}, whose permission has ended: {detail}"
+        for is_last in (False, True):
+            status = await self._post_action(await self._log_in_itself(), queued.action, detail)
+            if status not in _ENDED:
+                return
+            self._own_token = ""
+            if is_last:
+                raise ActionRefusedError(f"the engine refuses the station's own account: {status}")
+
+    async def _log_in_itself(self) -> str:
+        if not self._own_token:
             account = self._account
             body = {"userID": account.user, "password": account.password, "label": "operator station"}
-            self._own_token = await self._log_in(body, {})
-        audit = {
+            try:
+                self._own_token = await self._in_turn(lambda: self._log_in(body, {}))
+            except AuthenticationError as error:
+                if error.status in _ENDED:
+                    raise ActionRefusedError(f"the station's own account: {error}") from error
+                raise EngineAwayError(str(error), error.retry_after) from error
+            except _REQUEST_ERRORS as error:
+                raise EngineAwayError(_reason_of(error)) from error
+        return self._own_token
+
+    async def _post_action(self, token: str, action: AuditedAction, detail: str) -> int:
+        """Send an action with a token; return the status of the answer, if it was taken or the token was not.
+
+        Raises:
+            EngineAwayError: The engine does not take it now.
+            ActionRefusedError: The engine never takes it.
+        """
+        told = {
             "action": action.name,
             "subject": action.subject[:300],
-            "detail": action.detail[:300],
+            "detail": detail[:300],
             "address": action.address,
             "outcome": "done" if action.done else "refused",
         }
-        headers = _bearer(token or self._own_token)
+        try:
+            status, text, wait = await self._in_turn(lambda: self._post_audit(token, told))
+        except _REQUEST_ERRORS as error:
+            raise EngineAwayError(_reason_of(error)) from error
+        if status == HTTPStatus.TOO_MANY_REQUESTS or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+            raise EngineAwayError(text, wait)
+        if status >= HTTPStatus.BAD_REQUEST and status not in _ENDED:
+            raise ActionRefusedError(text)
+        return status
+
+    async def _post_audit(self, token: str, told: dict[str, str]) -> tuple[int, str, int]:
         async with self._session.post(
-            self._api / "audit", json=audit, headers=headers, **self._account.options
+            self._api / "audit", json=told, headers=_bearer(token), **self._account.options
         ) as reply:
-            if reply.status == HTTPStatus.UNAUTHORIZED and not token:
-                self._own_token = ""
-            reply.raise_for_status()
+            wait = _seconds(reply.headers.get(hdrs.RETRY_AFTER, ""))
+            return reply.status, f"{reply.status} {reply.reason}", wait
 
 
 def _reason_of(error: Exception) -> str:

@@ -62,8 +62,8 @@ async def read_audit(call: Call) -> models.AuditOut:
 async def note_action(call: Call) -> None:
     """Record a control action; a station sends it with the token of the acting user.
 
-    Anybody may do so for themselves. So nothing of it is believed but the user: it is marked as told, and has the
-    address from which it came beside the one that is told.
+    Any user may do so in their own name. So only the user is believed: the record is marked as told, and
+    has the address from which it came beside the one that is told.
     """
     body = call.read(models.AuditIn)
     if call.caller.role is UserRole.VIEWER and body.outcome == "done":
