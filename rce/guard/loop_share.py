@@ -40,8 +40,8 @@ class LoopShare:
     def __init__(self, *, slice_s: float = SLICE_S, clock: Callable[[], float] = time.perf_counter) -> None:
         self._slice = slice_s
         self._clock = clock
-        self._used: dict[str, tuple[float, float]] = {}
-        """User to the seconds that they used, and the time of that count."""
+        self._used: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        """User to the seconds that they used, and the time of that count; oldest first."""
         self._waiting: OrderedDict[str, deque[Workload]] = OrderedDict()
         self._round: asyncio.Handle | None = None
 
@@ -68,11 +68,6 @@ class LoopShare:
             if not workloads:
                 del self._waiting[user]
 
-    def leave(self, user: str) -> None:
-        """Forget a user without workloads."""
-        if user not in self._waiting:
-            self._used.pop(user, None)
-
     def _work(self, user: str, workload: Workload, used: float, now: float) -> bool:
         """Work until the user's slice is used up; return whether all was done."""
         more = True
@@ -82,7 +77,15 @@ class LoopShare:
             used += end - now
             now = end
         self._used[user] = used, now
+        self._used.move_to_end(user)
+        self._forget_oldest(now)
         return not more
+
+    def _forget_oldest(self, now: float) -> None:
+        """Remove the oldest count if all of it is forgotten, so that users who left are not kept."""
+        user, (used, since) = next(iter(self._used.items()))
+        if used <= (now - since) * _RECOVERY:
+            del self._used[user]
 
     def _plan(self) -> None:
         """Schedule a round after the loop has polled its sockets, so that new input is received first."""

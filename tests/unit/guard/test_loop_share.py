@@ -53,6 +53,18 @@ async def test_little_is_done_at_once() -> None:
     assert share.run("a", Load(clock, 1, lambda: None))
 
 
+async def test_users_who_left_are_not_kept() -> None:
+    clock = Clock()
+    share = LoopShare(slice_s=0.002, clock=clock)
+    for number in range(1000):
+        share.run(f"user{number}", Load(clock, 1, lambda: None))
+    clock.now += 1.0
+    for _ in range(1000):
+        share.run("a", Load(clock, 1, lambda: None))
+        clock.now += 0.01
+    assert len(share._used) < 10
+
+
 async def test_who_has_much_to_do_waits_for_the_others() -> None:
     assert await turns(("a", 8), ("b", 1), ("c", 3)) == [*"aa", "b", *"cc", *"aa", "c", *"aa", *"aa"]
 
