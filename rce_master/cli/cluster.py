@@ -31,7 +31,7 @@ from rce_master.cluster.files import CERTIFICATE, Machine, find_etcd, read_confi
 from rce_master.cluster.joining import (
     check_place,
     cluster_client,
-    forget_masters,
+    forget_machine,
     hint,
     remove_member,
     request_membership,
@@ -147,7 +147,7 @@ def remove(
         async with await cluster_client(endpoints, contexts) as client:
             leaving, others = await remove_member(client, name, contexts, force=force)
             typer.echo(f"removed {leaving.shown}; {hint(others)}")
-            for master in await forget_masters(client, DEFAULT_PREFIX, leaving):
+            for master in await forget_machine(client, leaving):
                 typer.echo(f"the other masters do not count {master} any more")
         typer.echo(
             "on that machine, if it is there: rce uninstall-service master; rce uninstall-service etcd; then"

@@ -7,10 +7,10 @@ import contextlib
 import os
 import socket
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
 from rce.dialing import open_socket
 from rce_master.cluster.client import ClusterClient, answering, ask_all, healthy
+from rce_master.cluster.engines import forget_masters, known_masters
 from rce_master.cluster.members import (
     ClusterError,
     Member,
@@ -22,8 +22,6 @@ from rce_master.cluster.members import (
     quorum,
 )
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdError, EtcdRefusedError
-from rce_master.store.etcd.layout import Keys, read_master
-from rce_master.store.etcd.wire import Delete
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -202,31 +200,26 @@ async def remove_member(
     return leaving, tuple(each for each in members if each.id != leaving.id)
 
 
-async def forget_masters(client: ClusterClient, prefix: str, leaving: Member) -> list[str]:
-    """Remove what etcd knows of the masters of a machine, so that packages do not wait for them.
+async def forget_machine(client: ClusterClient, leaving: Member) -> list[str]:
+    """Remove what etcd knows of the masters of a machine, of all engines that it keeps.
 
     Args:
         client: A client of all members.
-        prefix: Of the engine's keys.
         leaving: The machine's member of etcd.
 
     Returns:
         Their names.
 
     Raises:
-        EtcdError: etcd does not answer, or refused.
+        StoreError: etcd does not answer, refused, or a key was overwritten.
     """
-    keys = Keys(prefix)
-    known = [read_master(keys, record) for record in (await client.range(keys.masters)).records]
     gone = [
-        one.name
-        for one in known
-        if one.name.rpartition(":")[0] == leaving.name or urlsplit(one.url).hostname == leaving.host
+        one
+        for one in await known_masters(client)
+        if one.name.rpartition(":")[0] == leaving.name or one.host == leaving.host
     ]
-    operations = [Delete(key + name) for name in gone for key in (keys.masters, keys.drained)]
-    if operations:
-        await client.transact([], operations)
-    return gone
+    await forget_masters(client, gone)
+    return [one.shown for one in gone]
 
 
 async def cluster_client(endpoints: Sequence[str], tls: Context | None) -> ClusterClient:

@@ -14,15 +14,13 @@ from urllib.parse import urlsplit
 
 import yaml
 
-from rce.config.store_address import DEFAULT_PREFIX
 from rce.supervision.process import end_with
 from rce_master.cluster.client import ClusterClient, ask_all
+from rce_master.cluster.engines import forget_masters, known_masters
 from rce_master.cluster.files import Machine, find_etcd, read_config
 from rce_master.cluster.joining import START_S, check_ports
 from rce_master.cluster.members import ClusterError, Member, MemberStatus
 from rce_master.exceptions import StoreError
-from rce_master.store.etcd.layout import Keys, read_master
-from rce_master.store.etcd.wire import Delete
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -176,18 +174,16 @@ async def _forget_other_masters(client: ClusterClient, machine: Machine, tls: Co
     Raises:
         ClusterError: etcd works on one of these machines, which joined later than this one.
     """
-    keys = Keys(DEFAULT_PREFIX)
-    masters = [read_master(keys, record) for record in (await client.range(keys.masters)).records]
-    others = {one.name: urlsplit(one.url).hostname or "" for one in masters}
-    others = {name: host for name, host in others.items() if host != machine.host}
-    places = [
-        Member(number, name.rpartition(":")[0], "", _client_of(machine, host))
-        for number, (name, host) in enumerate(others.items(), 1)
-    ]
-    await _check_away(places, tls)
-    operations = [Delete(key + name) for name in others for key in (keys.masters, keys.drained)]
-    if operations:
-        await client.transact([], operations)
+    others = [one for one in await known_masters(client) if one.host != machine.host]
+    places = {one.host: one.name.rpartition(":")[0] for one in others}
+    await _check_away(
+        [
+            Member(number, name, "", _client_of(machine, host))
+            for number, (host, name) in enumerate(places.items(), 1)
+        ],
+        tls,
+    )
+    await forget_masters(client, others)
 
 
 def _owner(folder: Path) -> tuple[int | None, int | None]:
