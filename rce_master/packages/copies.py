@@ -91,6 +91,8 @@ class ArchiveCopies:
         """Since when no master is known that has a needed archive: hashes, and times."""
         self._lost: set[str] = set()
         """Those of them that count as lost."""
+        self._was_alone = False
+        """Whether no other master was known when archives were spread last."""
         self._faults: dict[str, str] = {}
         """What was wrong with each master at the last look."""
 
@@ -126,11 +128,14 @@ class ArchiveCopies:
     # Pushing
 
     @asynccontextmanager
-    async def spread(self, *archives: str) -> AsyncIterator[None]:
+    async def spread(self, *archives: str) -> AsyncIterator[str]:
         """Copy archives of this master to others; while the block runs, none of them removes any.
 
         Args:
             archives: Their hashes.
+
+        Yields:
+            A warning if no other master is known, so that the archives are on this machine only; else empty.
 
         Raises:
             StoreError: Too few masters have it; it has to be pushed again.
@@ -138,14 +143,25 @@ class ArchiveCopies:
         async with self._removal:
             self._pushed.update(archives)
         try:
-            await self._send_to_majority(archives)
-            yield
+            others = await self._registry.others()
+            await self._send_to_majority(archives, others)
+            yield self._note_alone(is_alone=not others)
         finally:
             self._pushed -= Counter(archives)
             self.look()
 
-    async def _send_to_majority(self, archives: Collection[str]) -> None:
-        others = await self._registry.others()
+    def _note_alone(self, *, is_alone: bool) -> str:
+        """Return the warning for the owner of what was spread, and log it once for the operator."""
+        warning = (
+            f"{self._noun}s are on one machine only, because no other master is known: they are lost with it;"
+            " masters that join get them"
+        )
+        if is_alone and not self._was_alone:
+            _log.warning("%s", warning)
+        self._was_alone = is_alone
+        return warning if is_alone else ""
+
+    async def _send_to_majority(self, archives: Collection[str], others: Sequence[OtherMaster]) -> None:
         missing = (len(others) + 1) // 2  # beside this master
         sent = {
             self._tasks.spawn(self._send(other, archives), name=f"send to {other.name}") for other in others

@@ -86,10 +86,13 @@ class ContentKeeper:
         return await self.store.read(sha256, offset, count)
 
     @contextlib.asynccontextmanager
-    async def keep(self, incoming: Incoming) -> AsyncIterator[None]:
+    async def keep(self, incoming: Incoming) -> AsyncIterator[str]:
         """Keep a content here and at a majority of the masters; the block makes the state name it.
 
         If it does not, the content is removed.
+
+        Yields:
+            A warning for its owner; empty if there is none.
 
         Raises:
             StoreError: It cannot be kept.
@@ -98,10 +101,10 @@ class ContentKeeper:
         try:
             await self.store.keep(incoming)
             if self._copies is None:
-                yield
+                yield ""
             else:
-                async with self._copies.spread(incoming.sha256):
-                    yield
+                async with self._copies.spread(incoming.sha256) as warning:
+                    yield warning
         finally:
             self._coming -= Counter((incoming.sha256,))
             self._dirty.set()

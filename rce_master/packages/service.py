@@ -85,19 +85,22 @@ class PackageService:
         """
         self._check_early(request, size)
         async with self._uploads.one(request.user) as upload:
-            package, contents = await self._take(request, upload.counted(chunks))
+            package, contents, warning = await self._take(request, upload.counted(chunks))
         kept = self._state_service.tables.packages.get(package.id) or package
-        return kept, (*contents.warnings, *self._warnings(contents))
+        return kept, (*contents.warnings, *self._warnings(contents), *filter(None, [warning]))
 
-    async def _take(self, request: PushRequest, chunks: AsyncIterator[bytes]) -> tuple[UserPackage, Contents]:
+    async def _take(
+        self, request: PushRequest, chunks: AsyncIterator[bytes]
+    ) -> tuple[UserPackage, Contents, str]:
+        """Accept an archive; return the version, what is in it, and a warning for its owner or nothing."""
         async with self._keeper.store.receive(chunks) as incoming:
             _verify(request, incoming)
             contents = await self._inspect(request.user, incoming)
             package = self._package(request, incoming, contents)
             packages.check_new(self._state_service.tables, package)
-            async with self._keeper.keep(incoming):
+            async with self._keeper.keep(incoming) as warning:
                 await self._state_service.submit(commands.AddPackage(package=package))
-        return package, contents
+        return package, contents, warning
 
     async def _inspect(self, user: str, incoming: Incoming) -> Contents:
         try:

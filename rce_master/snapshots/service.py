@@ -304,8 +304,8 @@ class SnapshotService:
         if missing:
             raise SnapshotError(f"the master does not hold {len(missing)} of its contents")
 
-    def _spread(self, *contents: str) -> AbstractAsyncContextManager[None]:
-        return contextlib.nullcontext() if self._copies is None else self._copies.spread(*contents)
+    def _spread(self, *contents: str) -> AbstractAsyncContextManager[str]:
+        return contextlib.nullcontext("") if self._copies is None else self._copies.spread(*contents)
 
 
 async def _once(data: bytes) -> AsyncIterator[bytes]:

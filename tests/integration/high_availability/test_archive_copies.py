@@ -149,6 +149,20 @@ async def test_contents_that_are_sent_are_not_removed(pair: Pair) -> None:
             assert (pair.others / pushed[0]).exists()
 
 
+async def test_a_master_that_is_alone_warns_of_one_copy(pair: Pair, caplog: pytest.LogCaptureFixture) -> None:
+    """More than half of one master is that one; the operator is told once, and each owner is."""
+    pushed = hashes(2, "pushed")
+    fill(pair.own, pushed)
+    fill(pair.others, pushed)
+    known = pair.registry.masters
+    warning = "packages are on one machine only, because no other master is known"
+    for masters, warned, logged in (([], True, 1), ([], True, 1), (known, False, 1), ([], True, 2)):
+        pair.registry.masters = masters
+        async with pair.copies.spread(*pushed) as told:
+            assert (warning in told) == warned
+            assert caplog.text.count(warning) == logged
+
+
 async def test_contents_stay_while_it_is_unknown_what_is_needed(pair: Pair) -> None:
     unneeded = hashes(2, "unneeded")
     fill(pair.others, unneeded)
