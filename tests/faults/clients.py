@@ -9,12 +9,13 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from http import HTTPStatus
 from typing import Any
 
 import aiohttp
 from support.engine import until
 
-from faults.history import Fate, History
+from faults.history import Expected, Fate, History
 from faults.machines import PATIENCE_S, Cluster
 from rce_master.leadership.core import STANDBY_HEADER
 
@@ -29,6 +30,9 @@ LAST_ANSWERS = 20
 """Answers that are told if no write is acknowledged in time."""
 TOKENS = 1500
 """A user may have 2000."""
+CONTAINERS = 3
+"""So many run at most that are known to; the oldest is removed for a new one."""
+CONTAINER_PAUSE_S = 1.0
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError)
 
 
@@ -74,13 +78,18 @@ class Clients:
             return found
 
     @asynccontextmanager
-    async def under_load(self) -> AsyncIterator[None]:
-        """Write and read all the time."""
+    async def under_load(self, *, containers: bool = False) -> AsyncIterator[None]:
+        """Write and read all the time.
+
+        Args:
+            containers: Make and remove containers, too.
+        """
         users = [(name, number) for number, name in enumerate(REGISTER_USERS)]
         tasks = self._tasks = [
             asyncio.create_task(self._make_tokens(0)),
             *(asyncio.create_task(self._write(name, number)) for name, number in users),
             *(asyncio.create_task(self._read(name, number)) for name, number in users),
+            *([asyncio.create_task(self._change_containers(0))] if containers else []),
         ]
         try:
             yield
@@ -142,6 +151,33 @@ class Clients:
                     used += 1
                 await asyncio.sleep(PAUSE_S)
 
+    async def _change_containers(self, used: int) -> None:
+        known = self._history.containers
+        async with self.session() as session:
+            for number in itertools.count():
+                there = [name for name, expected in known.items() if expected is not Expected.GONE]
+                if len(there) >= CONTAINERS:
+                    url = f"{self._url(used)}api/v1/containers/{there[0]}"
+                    used += not await self._change(session, there[0], "DELETE", url)
+                name = f"box{number}"
+                known[name] = Expected.GONE
+                url = f"{self._url(used)}api/v1/containers"
+                used += not await self._change(session, name, "POST", url, {"tag": name})
+                await asyncio.sleep(CONTAINER_PAUSE_S)
+
+    async def _change(
+        self, session: aiohttp.ClientSession, name: str, method: str, url: str, body: object = None
+    ) -> bool:
+        """Make or remove a container; return whether the master did it."""
+        before, known = self._history.containers[name], self._history.containers
+        known[name] = Expected.EITHER  # if the test ends meanwhile, too
+        fate, _ = await self._ask(session, method, url, body)
+        if fate is Fate.DONE:
+            known[name] = Expected.RUNS if method == "POST" else Expected.GONE
+        elif fate is Fate.NOT_DONE:
+            known[name] = before
+        return fate is Fate.DONE
+
     async def _write(self, user: str, used: int) -> None:
         async with self.session() as session:
             while True:
@@ -175,7 +211,9 @@ class Clients:
         try:
             async with session.request(method, url, json=body) as reply:
                 if reply.status < 300:
-                    return Fate.DONE, await reply.json()
+                    return Fate.DONE, await reply.json() if reply.content_length else {}
+                if reply.status == HTTPStatus.NOT_FOUND and method == "DELETE":
+                    return Fate.DONE, {}
                 text = await reply.text()
                 assert reply.status in {500, 502, 503}, (reply.status, text)
                 self._answers.append(f"{method} {url}: {reply.status} {text}")

@@ -24,6 +24,15 @@ class Fate(Enum):
     UNKNOWN = "unknown"
 
 
+class Expected(Enum):
+    """What must be true of a container by the answers of the masters."""
+
+    RUNS = "runs"
+    GONE = "gone"
+    EITHER = "either"
+    """A request about it was not answered."""
+
+
 @dataclass(frozen=True, slots=True)
 class Heard:
     """A master's message to a task set, in seconds since the start of the machine."""
@@ -40,6 +49,7 @@ class History:
 
     Attributes:
         made: The fate of each request that makes a robot's token, by the robot.
+        containers: What is expected of each container.
         registers: Reads and writes of each register.
         heard: What masters told task sets, in the order in which it came.
         acknowledged: Start and end of each write that was acknowledged.
@@ -49,6 +59,7 @@ class History:
     """
 
     made: dict[str, Fate] = field(default_factory=dict)
+    containers: dict[str, Expected] = field(default_factory=dict)
     registers: dict[str, list[Operation]] = field(default_factory=dict)
     heard: list[Heard] = field(default_factory=list)
     acknowledged: list[tuple[float, float]] = field(default_factory=list)
@@ -66,6 +77,32 @@ class History:
     def read(self, register: str, start: float, end: float, value: int) -> None:
         """Note a read."""
         self.registers.setdefault(register, []).append(Operation(start, end, False, value))
+
+    def misplaced(self, running: Iterable[str]) -> list[str]:
+        """Return what a task set does that was not asked for, or does not do that was.
+
+        Args:
+            running: The containers that it runs, once for each.
+        """
+        count = Counter(running)
+        return [
+            *(
+                f"container {name} was acknowledged and does not run"
+                for name, expected in self.containers.items()
+                if expected is Expected.RUNS and not count[name]
+            ),
+            *(
+                f"container {name} was removed, or refused, and runs"
+                for name, expected in self.containers.items()
+                if expected is Expected.GONE and count[name]
+            ),
+            *(f"container {name} runs {times} times" for name, times in count.items() if times > 1),
+            *(
+                f"container {name} runs and was not asked for"
+                for name in count
+                if name not in self.containers
+            ),
+        ]
 
     def first_write_after(self, at: float) -> float | None:
         """Return when the first write was acknowledged that was asked for after a time."""

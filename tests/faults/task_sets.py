@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import json
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -150,6 +151,17 @@ class TaskSets:
             for process in engine_processes(self.folder)
             if "stringEcho.py" in " ".join(command_line(process))
         }
+
+
+def running_containers(folder: Path) -> list[str]:
+    """Return the tags of the containers whose environments run, but the robot's own."""
+    found = []
+    for process in engine_processes(folder):
+        words = command_line(process)
+        if "rce_container.environment" in words and "/bin/sh" not in words[0]:
+            tag = json.loads(words[-1])["id"].partition("/")[2]
+            found += [tag] if tag.startswith("box") else []
+    return found
 
 
 @asynccontextmanager

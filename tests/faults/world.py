@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from support.engine import until
 
 from faults.clients import INITIAL, Clients
 from faults.goals import Times
-from faults.history import History
+from faults.history import Expected, History
 from faults.machines import PATIENCE_S, Cluster, Machine, cluster
-from faults.task_sets import Prober, Robot, task_sets
+from faults.task_sets import Prober, Robot, running_containers, task_sets
 
 
 @dataclass
@@ -25,6 +26,7 @@ class World:
     Attributes:
         scale: 1: as long as in a test run; more: the long run.
         robot: The robot whose links must not be interrupted; None: there are no task sets.
+        misplaced: What the container task set does at the end that it should not, or does not do.
     """
 
     cluster: Cluster
@@ -34,6 +36,7 @@ class World:
     rng: random.Random
     scale: float = 1.0
     robot: Robot | None = None
+    misplaced: list[str] = field(default_factory=list)
 
     async def until_written(self, what: str, since: float) -> float:
         """Note how long it took until a write was acknowledged that was asked for after a fault."""
@@ -84,6 +87,17 @@ class World:
         await self.cluster.repair()
         await self.clients.wait_for_writes()
 
+    async def until_containers_are_right(self) -> None:
+        """Wait until exactly the containers run that were acknowledged and not removed."""
+        folder, history = self.cluster.folder, self.history
+
+        def right() -> bool:
+            return not history.misplaced(running_containers(folder))
+
+        with contextlib.suppress(AssertionError):
+            await until(right, timeout=PATIENCE_S, what="the right containers run")
+        self.misplaced = history.misplaced(running_containers(folder))
+
     async def standby(self) -> Machine:
         """Return a machine whose master does not lead."""
         leader = await self.cluster.leader()
@@ -110,11 +124,16 @@ async def world(
             if robot:
                 made.robot = await running.enter_async_context(task_sets(machines, history))
             await running.enter_async_context(Prober(machines, history).running())
-            await running.enter_async_context(clients.under_load())
-            yield made
-            await made.whole()
-        violations = history.violations(await clients.stored(), INITIAL)
+            load = clients.under_load(containers=robot)
+            async with load:
+                yield made
+                await made.whole()
+            if robot:
+                await made.until_containers_are_right()
+        violations = [*history.violations(await clients.stored(), INITIAL), *made.misplaced]
         if made.robot is not None:
             times.add("longest gap of the robot's echo", made.robot.longest_gap)
         assert not violations, f"seed {seed}:\n" + "\n".join(violations)
         assert history.heard, "no master told a task set anything"
+        if robot:
+            assert Expected.RUNS in history.containers.values(), "no container was made"

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from faults.catalogue import SCENARIOS
 from faults.goals import GOALS, Times
-from faults.history import Fate, Heard, History
+from faults.history import Expected, Fate, Heard, History
 from faults.linearizability import Operation, is_linearizable, unexplained
 from hypothesis import given
 from hypothesis import strategies as st
@@ -182,3 +182,16 @@ def test_scenarios_have_names_of_their_own() -> None:
     names = [each.name for each in SCENARIOS]
     assert len(set(names)) == len(names)
     assert {"kill", "terminate", "upgrade"} <= set(names)
+
+
+def test_containers_run_as_they_were_acknowledged() -> None:
+    history = History(
+        containers={"a": Expected.RUNS, "b": Expected.GONE, "c": Expected.EITHER, "d": Expected.EITHER}
+    )
+    assert history.misplaced(["a", "c"]) == []
+    assert history.misplaced([]) == ["container a was acknowledged and does not run"]
+    assert history.misplaced(["a", "b", "c", "c", "e"]) == [
+        "container b was removed, or refused, and runs",
+        "container c runs 2 times",
+        "container e runs and was not asked for",
+    ]
