@@ -331,6 +331,17 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
     return report
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the figures that tests recorded by ``record_property("figures", TEXT)``."""
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if getattr(report, "when", None) == "call":
+                for name, text in report.user_properties:
+                    if name == "figures":
+                        terminalreporter.section(report.nodeid)
+                        terminalreporter.write_line(text)
+
+
 @pytest.fixture(scope="session")
 def rce_data() -> Path:
     """The folder of public maps and lidar logs, for tests that are marked with ``needs("data")``."""

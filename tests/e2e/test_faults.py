@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,10 @@ SHORT = [each for each in SCENARIOS if each.short]
 
 
 @pytest.mark.parametrize("scenario", SHORT, ids=[each.name for each in SHORT])
-async def test_nothing_is_lost_and_no_link_is_cut(scenario: Scenario, folder: Path) -> None:
+async def test_nothing_is_lost_and_no_link_is_cut(
+    scenario: Scenario, folder: Path, record_property: Callable[[str, object], None]
+) -> None:
     times = Times()
     async with world(folder, SEED, times, robot=scenario.robot) as made:
         await scenario.run(made)
-    print("\n".join(times.table()))  # noqa: T201 - beside the goals
+    record_property("figures", "\n".join(times.table()))

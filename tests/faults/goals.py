@@ -23,10 +23,16 @@ class Times:
 
     def __init__(self) -> None:
         self._found: dict[str, list[float]] = {}
+        self._checked: dict[str, tuple[int, int]] = {}
 
     def add(self, what: str, value: float) -> None:
         """Note a time, seconds."""
         self._found.setdefault(what, []).append(value)
+
+    def checked(self, what: str, right: int, wrong: int) -> None:
+        """Note how many things were checked, and how many of them were wrong."""
+        before = self._checked.get(what, (0, 0))
+        self._checked[what] = before[0] + right + wrong, before[1] + wrong
 
     def table(self) -> Iterator[str]:
         """Return lines with what was measured beside the goals."""
@@ -35,3 +41,7 @@ class Times:
             goal = f"< {GOALS[what]:g}" if what in GOALS else ""
             middle, most = statistics.median(values), max(values)
             yield f"{what:42} {len(values):4} {middle:7.2f} {most:7.2f} {goal:>7}"
+        if self._checked:
+            yield f"{'checked':42} {'n':>4} {'wrong':>15} {'goal':>7}"
+        for what, (count, wrong) in self._checked.items():
+            yield f"{what:42} {count:4} {wrong:15} {'0':>7}"

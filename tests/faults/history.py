@@ -121,17 +121,18 @@ class History:
             initial: What registers held at the start.
         """
         return [
-            *self._lost(Counter(stored)),
+            *self.lost(Counter(stored)),
             *(
                 f"{name} is not linearizable: {' '.join(map(str, unexplained(operations, initial)))}"
                 for name, operations in self.registers.items()
                 if not is_linearizable(operations, initial)
             ),
-            *self._of_older_terms(),
+            *self.of_older_terms(),
             *self.lost_links,
         ]
 
-    def _lost(self, stored: Counter[str]) -> Iterable[str]:
+    def lost(self, stored: Counter[str]) -> Iterable[str]:
+        """Yield what was acknowledged and is lost, refused and done, or done twice."""
         for robot, fate in self.made.items():
             if fate is Fate.DONE and not stored[robot]:
                 yield f"{robot} was acknowledged and is lost"
@@ -150,7 +151,8 @@ class History:
             for master, start, end in self.cuts
         )
 
-    def _of_older_terms(self) -> Iterable[str]:
+    def of_older_terms(self) -> Iterable[str]:
+        """Yield what was heard of masters that led no more, and of two that led at once."""
         begun: dict[int, float] = {}
         leaders: dict[int, str] = {}
         for each in self.heard:

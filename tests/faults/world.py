@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import random
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
@@ -104,6 +105,16 @@ class World:
         return self.rng.choice([each for each in self.cluster.machines if each is not leader])
 
 
+def count_checked(times: Times, history: History, stored: list[str], misplaced: list[str]) -> None:
+    """Note what was checked of a history, and how much of it was wrong."""
+    lost = len(list(history.lost(Counter(stored))))
+    times.checked("requests, lost or done twice", len(history.made) - lost, lost)
+    acts = len(list(history.of_older_terms()))
+    times.checked("messages to task sets, by a former leader", len(history.heard) - acts, acts)
+    times.checked("robots' links, interrupted", 1, len(history.lost_links))
+    times.checked("containers, not as acknowledged", len(history.containers), len(misplaced))
+
+
 @asynccontextmanager
 async def world(
     folder: Path, seed: int, times: Times, *, scale: float = 1.0, robot: bool = True
@@ -130,7 +141,9 @@ async def world(
                 await made.whole()
             if robot:
                 await made.until_containers_are_right()
-        violations = [*history.violations(await clients.stored(), INITIAL), *made.misplaced]
+        stored = await clients.stored()
+        count_checked(times, history, stored, made.misplaced)
+        violations = [*history.violations(stored, INITIAL), *made.misplaced]
         if made.robot is not None:
             times.add("longest gap of the robot's echo", made.robot.longest_gap)
         assert not violations, f"seed {seed}:\n" + "\n".join(violations)

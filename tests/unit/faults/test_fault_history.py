@@ -176,6 +176,9 @@ def test_each_time_is_told_beside_its_goal() -> None:
     assert of_goal.split()[-6:] == ["master", "3", "0.50", "1.50", "<", "1"]
     assert without.split() == ["another", "fault", "1", "3.00", "3.00"]
     assert set(GOALS) >= {"SIGTERM of the leading master"}
+    times.checked("requests", 20, 1)
+    times.checked("requests", 10, 0)
+    assert list(times.table())[-1].split() == ["requests", "31", "1", "0"]
 
 
 def test_scenarios_have_names_of_their_own() -> None:
