@@ -224,3 +224,22 @@ def moves_to(
                 field[other] = moves
                 queue.append(other)
     return field
+
+
+def costs_to(goal: int, roads: Roads) -> list[int]:
+    """Return the cost of the cheapest way to a goal from each cell, without regard to robots."""
+    if not roads.costs:
+        return moves_to(goal, roads.neighbours, roads.shut, roads.closed)
+    field = [FAR] * len(roads.neighbours)
+    field[goal] = 0
+    heap = [(0, goal)]
+    while heap:
+        cost, cell = heappop(heap)
+        if cost > field[cell] or (cell in roads.shut and cell != goal):
+            continue
+        through = cost + roads.costs.get(cell, 1)
+        for other in roads.neighbours[cell]:
+            if through < field[other] and (other, cell) not in roads.closed:
+                field[other] = through
+                heappush(heap, (through, other))
+    return field

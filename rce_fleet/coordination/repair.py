@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.path_search import FAR, Roads, find_path, is_enclosed, moves_to
+from rce_fleet.coordination.path_search import FAR, Roads, costs_to, find_path, is_enclosed, moves_to
 from rce_fleet.coordination.robot import Phase
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class PathRepair:
         if goal == start and not ledger.occupied(start, robot):
             ledger.truncate(robot)
             return True
-        roads = self._roads(forbidden)
+        roads = self._roads(robot, forbidden)
         if self._find(record, goal, roads, self._field(goal, forbidden), effort):
             return True
         if is_enclosed(start, goal, roads):
@@ -71,7 +71,7 @@ class PathRepair:
         if not is_in_the_way and start not in forbidden and not state.is_shut(start):
             record.rest = start
             return True
-        return self._find(record, None, self._roads(forbidden), None, effort)
+        return self._find(record, None, self._roads(robot, forbidden), None, effort)
 
     def _note_unreachable(self, record: RobotRecord, *, is_unreachable: bool) -> None:
         if record.unreachable != is_unreachable:
@@ -108,10 +108,10 @@ class PathRepair:
         start = state.ledger.end_of_grant(record.id)
         assert start is not None
         forbidden = state.forbidden(record.id)
-        roads = self._roads(forbidden)
+        roads = self._roads(record.id, forbidden)
         field = [FAR] * len(roads.neighbours)
         if goal is not None and goal not in roads.shut:
-            field = moves_to(goal, roads.neighbours, roads.shut, roads.closed)
+            field = costs_to(goal, roads)
         is_unreachable = goal is not None and field[start] >= FAR
         self._note_unreachable(record, is_unreachable=is_unreachable)
         if goal is None or is_unreachable or goal == start:
@@ -123,7 +123,7 @@ class PathRepair:
                 for way in roads.neighbours[cell]
                 if way not in roads.shut and (cell, way) not in roads.closed
             ]
-            cell = min(ways, key=field.__getitem__)
+            cell = min(ways, key=lambda way: field[way] + roads.costs.get(way, 1))
             step += 1.0
             path.append((cell, step))
         state.ledger.insert(record.id, path)
@@ -133,7 +133,7 @@ class PathRepair:
             return False
         return start == goal or self._field(goal, forbidden)[start] < FAR
 
-    def _roads(self, forbidden: frozenset[int]) -> Roads:
+    def _roads(self, robot: str, forbidden: frozenset[int]) -> Roads:
         """Return where a robot may drive."""
         state = self._state
         shut = set(state.blocked) | state.pending | forbidden
@@ -144,7 +144,7 @@ class PathRepair:
             state.grid.neighbours,
             shut,
             state.zones.closed(state.grid),
-            state.zones.costs(),
+            state.zones.costs_of(robot),
             frozenset(state.index.goals),
         )
 

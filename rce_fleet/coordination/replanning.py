@@ -13,20 +13,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.coordination.rerouting import NO_CELL, LedgerCopy, Rerouting, compute_rerouting, copy_ledger
+from rce_fleet.coordination.rerouting import (
+    NO_CELL,
+    LedgerCopy,
+    Rerouting,
+    compute_rerouting,
+    copy_ledger,
+    weighted_graph,
+)
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.starvation import urgency_of
 from rce_fleet.coordination.targets import assign_targets
 from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.coordination.zones import ZoneKind
-from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.motion import Motion, heading_of
 from rce_fleet.planning.planner import DEFAULT_PLANNER, PlanningProblem, load_planner
 from rce_fleet.planning.straightening import ends_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
@@ -53,6 +59,7 @@ class PlanRequest:
         planner: Name of the planner.
         closed: Moves ``(from, to)`` that no robot may make.
         costs: ``(cell, cost of entering it)`` where it is not 1.
+        own_costs: ``(indexes of robots, costs)`` where single robots have other costs.
         forbidden: ``(index of a robot, cells that it may not enter)``.
         headings: Heading of each robot at its start, see :mod:`rce_fleet.planning.motion`.
         quarter_turn: Time of a quarter turn, in steps; 0: turns are not counted.
@@ -74,6 +81,7 @@ class PlanRequest:
     planner: str = DEFAULT_PLANNER
     closed: tuple[tuple[int, int], ...] = ()
     costs: tuple[tuple[int, int], ...] = ()
+    own_costs: tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...] = ()
     forbidden: tuple[tuple[int, tuple[int, ...]], ...] = ()
     headings: tuple[int, ...] = ()
     quarter_turn: float = 0.0
@@ -151,6 +159,7 @@ def request_plan(
         planner=DEFAULT_PLANNER if settings.planner == "dijkstra" else settings.planner,
         closed=tuple(sorted(state.zones.closed(state.grid))),
         costs=tuple(sorted(state.zones.costs().items())),
+        own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
         headings=() if members else tuple(_heading(state, robot) for robot in robots),
         quarter_turn=settings.quarter_turn,
@@ -171,6 +180,19 @@ def _heading(state: FleetState, robot: str) -> int:
         return heading_of(state.robots[robot].yaw - grid.yaw)
     (row, column), (row_before, column_before) = grid.place(granted[-1]), grid.place(granted[-2])
     return heading_of(atan2(row - row_before, column - column_before))
+
+
+def _own_costs(
+    state: FleetState, robots: list[str]
+) -> tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...]:
+    """Return the costs of robots that have zones of their own, those with the same zones together."""
+    common = state.zones.costs()
+    alike: dict[int, tuple[list[int], Mapping[int, int]]] = {}
+    for index, robot in enumerate(robots):
+        costs = state.zones.costs_of(robot)
+        if costs is not common:
+            alike.setdefault(id(costs), ([], costs))[0].append(index)
+    return tuple((tuple(indexes), tuple(sorted(costs.items()))) for indexes, costs in alike.values())
 
 
 def _forbidden(state: FleetState, robots: list[str]) -> Iterator[tuple[int, tuple[int, ...]]]:
@@ -222,13 +244,9 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         closed=frozenset(request.closed),
         forbidden={request.robots[index]: cells for index, cells in forbidden.items()},
     )
-    costs = None
-    if request.costs:
-        costs = np.ones(len(grid), dtype=np.int32)
-        for cell, cost in request.costs:
-            costs[cell] = cost
+    graph, own_costs = weighted_graph(request, grid)
     problem = PlanningProblem.of(
-        PlanningGraph.from_grid(grid, costs=costs, closed=request.closed),
+        graph,
         request.starts,
         [targets.cells[robot] for robot in request.robots],
         seed=request.seed,
@@ -241,6 +259,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         ),
         urgency=request.urgency or None,
         lifelong=True,
+        own_costs=own_costs,
     )
     joint = (planner or load_planner(request.planner)).plan(problem)
     steps, visitors, cells = joint.visits()

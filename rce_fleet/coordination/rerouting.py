@@ -117,11 +117,9 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
     copy = request.copy
     assert copy is not None
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
-    costs = np.ones(len(grid), dtype=np.int32)
-    for cell, cost in request.costs:
-        costs[cell] = cost
+    graph, own_costs = weighted_graph(request, grid)
     found = reroute(
-        PlanningGraph.from_grid(grid, costs=costs, closed=request.closed),
+        graph,
         RoutedRobots(
             starts=np.array(request.starts, np.int32),
             begins=_floats(copy.begins),
@@ -137,6 +135,7 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
         effort=min(request.effort, _MOST_EFFORT),
         seed=request.seed,
         forbidden={index: frozenset(cells) for index, cells in request.forbidden} or None,
+        own_costs=own_costs,
     )
     if found is None:
         return Rerouting(found=False)
@@ -146,6 +145,25 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
         tuple(tuple(zip(cells.tolist(), at.tolist(), strict=True)) for cells, at in found.paths.values()),
         found.unreachable,
     )
+
+
+def weighted_graph(
+    request: PlanRequest, grid: GridMap
+) -> tuple[PlanningGraph, dict[int, NDArray[np.int32]] | None]:
+    """Return the graph of a request, and the costs of its edges for robots that have their own, by index."""
+    graph = PlanningGraph.from_grid(grid, costs=_cell_costs(request.costs, grid), closed=request.closed)
+    own: dict[int, NDArray[np.int32]] = {}
+    for robots, pairs in request.own_costs:
+        costs = PlanningGraph.from_grid(grid, costs=_cell_costs(pairs, grid), closed=request.closed).costs
+        own |= dict.fromkeys(robots, costs)
+    return graph, own or None
+
+
+def _cell_costs(pairs: Sequence[tuple[int, int]], grid: GridMap) -> NDArray[np.int32]:
+    costs = np.ones(len(grid), dtype=np.int32)
+    for cell, cost in pairs:
+        costs[cell] = cost
+    return costs
 
 
 def _ints(stored: bytes) -> NDArray[np.int32]:

@@ -1,8 +1,8 @@
 """Zones: parts of the map with rules of their own. Pure.
 
-A zone blocks cells or moves, slows robots down, has one direction, or has room for a few robots. It has a
-reason and an author, may expire, and may apply to some robots only. The same id replaces a zone, so setting
-it twice is harmless. All zones together have a revision, against lost updates.
+A zone blocks cells or moves, slows robots down, has one direction, has room for a few robots, or costs more.
+It has a reason and an author, may expire, and may apply to some robots only. The same id replaces a zone, so
+setting it twice is harmless. All zones together have a revision, against lost updates.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from math import ceil, inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import ZoneError
-from rce_fleet.limits import LEAST_SPEED, MOST_ROOM, MOST_SPEED
+from rce_fleet.limits import LEAST_SPEED, MOST_FACTOR, MOST_ROOM, MOST_SPEED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rce_fleet.planning.grid import GridMap
 
 NOMINAL_SPEED = 0.5
 """Speed of robots outside slow zones, metres per second, when costs of slow zones are computed."""
 _MAX_COST = 20
+"""A cell counts at most so much in plans. Paths of single robots are found as if entering it took so long."""
 
 
 class ZoneKind(Enum):
@@ -36,6 +37,8 @@ class ZoneKind(Enum):
     """Robots do not drive against its direction."""
     LIMITED = "limited"
     """It has room for a few robots."""
+    COST = "cost"
+    """Robots prefer other ways."""
 
 
 class Direction(Enum):
@@ -64,6 +67,7 @@ class Zone:
         speed: Greatest speed in a slow zone, metres per second.
         direction: Of a one-way zone.
         capacity: Robots for which a limited zone has room.
+        cost: How much a metre counts in a cost zone.
         reason: Why it was made, for people.
         by: Who made it.
         expires: When it ends, seconds of the planner's clock; infinity: when it is removed.
@@ -80,6 +84,17 @@ class Zone:
     reason: str = ""
     by: str = ""
     expires: float = inf
+    cost: float = 0.0
+
+    @property
+    def weight(self) -> int:
+        """Cost of entering one of its cells; 1: as anywhere else."""
+        factor = 1.0
+        if self.kind is ZoneKind.SLOW:
+            factor = NOMINAL_SPEED / self.speed
+        elif self.kind is ZoneKind.COST:
+            factor = self.cost
+        return max(ceil(min(factor, _MAX_COST)), 1)
 
     def applies_to(self, robot: str) -> bool:
         """Return whether the zone's rule is for this robot."""
@@ -123,6 +138,10 @@ class Zone:
                 self.kind is ZoneKind.LIMITED and not 1 <= self.capacity <= MOST_ROOM,
                 f"{where}: a limited zone needs a capacity of 1 .. {MOST_ROOM}, not {self.capacity}",
             ),
+            (
+                self.kind is ZoneKind.COST and not 1 <= self.cost <= MOST_FACTOR,
+                f"{where}: in a cost zone a metre counts 1 .. {MOST_FACTOR:g}, not {self.cost}",
+            ),
         )
         for is_wrong, text in checks:
             if is_wrong:
@@ -145,7 +164,8 @@ class ZoneBook:
     def _forget(self) -> None:
         """Forget what was computed from the zones."""
         self._closed: frozenset[tuple[int, int]] | None = None
-        self._costs: dict[int, int] | None = None
+        self._costs: dict[tuple[str, ...], dict[int, int]] = {}
+        self._costs_of: dict[str, dict[int, int]] = {}
         self._cells: dict[str, frozenset[int]] = {}
         self._blocking: dict[int, Zone] | None = None
         self._forbidden: dict[tuple[str, ...], frozenset[int]] = {}
@@ -226,16 +246,33 @@ class ZoneBook:
             )
         return self._closed
 
-    def costs(self) -> dict[int, int]:
-        """Return the cost of entering cells of slow zones; all others cost 1."""
-        if self._costs is None:
-            costs: dict[int, int] = {}
-            for zone in self.of_kind(ZoneKind.SLOW):
-                cost = max(ceil(min(NOMINAL_SPEED / zone.speed, _MAX_COST)), 1)
+    def costs(self) -> Mapping[int, int]:
+        """Return the cost of entering cells of slow zones and cost zones for all robots; others cost 1."""
+        return self._costs_in([zone for zone in self._costly() if not zone.robots])
+
+    def costs_of(self, robot: str) -> Mapping[int, int]:
+        """Return the cost of entering cells for one robot.
+
+        Robots with the same zones share one object; it is that of :meth:`costs` for those without own zones.
+        """
+        found = self._costs_of.get(robot)
+        if found is None:
+            found = self._costs_in([zone for zone in self._costly() if zone.applies_to(robot)])
+            self._costs_of[robot] = found
+        return found
+
+    def _costly(self) -> list[Zone]:
+        return [zone for zone in self.zones.values() if zone.weight > 1]
+
+    def _costs_in(self, zones: list[Zone]) -> dict[int, int]:
+        key = tuple(zone.id for zone in zones)
+        found = self._costs.get(key)
+        if found is None:
+            found = self._costs[key] = {}
+            for zone in zones:
                 for cell in zone.cells:
-                    costs[cell] = max(costs.get(cell, 1), cost)
-            self._costs = costs
-        return self._costs
+                    found[cell] = max(found.get(cell, 1), zone.weight)
+        return found
 
     def speed_limit(self, robot: str, cells: Sequence[int]) -> float:
         """Return the greatest speed of a robot in some cells, metres per second; infinity without a limit."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.manager.mirror import Mirror
-from rce_fleet.manager.zones import COST, rule
+from rce_fleet.manager.zones import rule
 from rce_fleet.tasks.other_floor import leave_floor
 from rce_fleet.tasks.records import AUTOMATIC, BlockedCells, FleetEntry, PlannerRun, RobotEntry, Zone
 
@@ -236,7 +236,7 @@ class PlannerSync:
         return {name: Zone(name, "", ()) for name, zone in zones.items() if zone.unsent}
 
     def _zones_kept(self) -> dict[str, Zone]:
-        return {zone.id: rule(zone) for zone in self._book.zones.values() if zone.kind != COST}
+        return {zone.id: rule(zone) for zone in self._book.zones.values()}
 
     def _zones_of_both(self) -> tuple[dict[str, Zone], dict[str, Zone]]:
         return self._zones_kept(), {zone.id: rule(zone) for zone in self._facts.zones.values()}

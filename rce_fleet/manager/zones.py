@@ -6,7 +6,7 @@
 | ``slow`` | metres per second |
 | ``one_way`` | radians from the grid's columns: 0, pi/2, pi, -pi/2 |
 | ``limited`` | number of robots |
-| ``cost``: not sent, the manager counts ways in it | how much a metre counts |
+| ``cost`` | how much a metre counts |
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from rce_fleet.planning.grid import GridMap
 
-COST = "cost"
 _DIRECTIONS = ("+x", "+y", "-x", "-y")
 _NEAR = 0.1
 """Radians that a direction may differ from one of the grid's four."""
@@ -69,7 +68,7 @@ def zone_fields(zone: Zone, now: float) -> dict[str, Any]:
     """Return the fields of a ``fleet/Zone``.
 
     Args:
-        zone: The zone; of another kind than ``cost``.
+        zone: The zone.
         now: Seconds since 1970.
     """
     value = zone.value or 0.0
@@ -82,6 +81,7 @@ def zone_fields(zone: Zone, now: float) -> dict[str, Any]:
         "speed": value if zone.kind == "slow" else 0.0,
         "direction": _DIRECTIONS[_quarters(value) % 4] if zone.kind == "one_way" else "",
         "capacity": int(value) if zone.kind == "limited" else 0,
+        "cost": value if zone.kind == "cost" else 0.0,
         "reason": zone.reason,
         "by": zone.user,
         "lifetime": 0.0 if zone.until is None else max(zone.until - now, 0.001),
@@ -101,6 +101,8 @@ def read_zone(message: dict[str, Any], now: float) -> Zone:
         value = within(float(message["speed"]), *ZONE_VALUES[kind])
     elif kind == "limited":
         value = within(float(message["capacity"]), *ZONE_VALUES[kind])
+    elif kind == "cost":
+        value = within(float(message["cost"]), *ZONE_VALUES[kind])
     elif kind == "one_way":
         value = _quarters(_DIRECTIONS.index(message["direction"]) * pi / 2) * pi / 2
     edges = message["edges"]
@@ -148,7 +150,7 @@ def _problems_of_value(kind: str, value: float) -> Iterator[str]:
         yield f"a slow zone needs a speed of {_range(kind)} m/s, not {value:g}"
     elif kind == "limited" and (within(value, *ZONE_VALUES[kind]) != value or value != int(value)):
         yield f"limited is a whole number of robots within {_range(kind)}, not {value:g}"
-    elif kind == COST and within(value, *ZONE_VALUES[kind]) != value:
+    elif kind == "cost" and within(value, *ZONE_VALUES[kind]) != value:
         yield f"in a cost zone a metre counts {_range(kind)}, not {value:g}"
     elif kind == "one_way" and abs(value / (pi / 2) - round(value / (pi / 2))) > _NEAR / (pi / 2):
         yield f"a direction is 0, pi/2, pi or -pi/2 radians from the grid's columns, not {value:g}"

@@ -28,6 +28,7 @@ class Compaction:
         starts: Start of each robot.
         goals: Goal of each robot.
         forbidden: For some robots the nodes that only these must not enter.
+        own_costs: For some robots the cost of every edge.
     """
 
     def __init__(self, problem: PlanningProblem) -> None:
@@ -48,6 +49,8 @@ class Compaction:
             robot: frozenset(self._number[[node for node in nodes if kept[node]]].tolist())
             for robot, nodes in (problem.forbidden or {}).items()
         }
+        alike = {id(costs): self.edges(costs) for costs in (problem.own_costs or {}).values()}
+        self.own_costs = {robot: alike[id(costs)] for robot, costs in (problem.own_costs or {}).items()}
 
     def edges(self, values: Ints) -> Ints:
         """Return those of the values of a graph's edges that belong to the kept ones."""

@@ -48,6 +48,7 @@ def distance_fields(
     goals: Sequence[int] | Ints,
     forbidden: Mapping[int, frozenset[int]] | None = None,
     starts: Sequence[int] | Ints = (),
+    own_costs: Mapping[int, Ints] | None = None,
 ) -> Ints:
     """Return the distance to each goal, shape (goals, nodes); :data:`UNREACHABLE` where there is no path.
 
@@ -56,14 +57,18 @@ def distance_fields(
         goals: Nodes where the paths end.
         forbidden: Nodes that cannot be entered for some of the goals, by their index.
         starts: Nodes that paths to each goal begin at; such a node has a distance even if it is forbidden.
+        own_costs: Costs of all edges for some of the goals, by their index.
     """
     table = np.empty((len(goals), len(graph)), dtype=np.int32)
     fill_fields(graph, np.asarray(goals, np.int32), table)
-    alike: dict[frozenset[int], list[int]] = {}
-    for index, closed in (forbidden or {}).items():
-        alike.setdefault(closed, []).append(index)
-    for closed, indices in alike.items():
-        table[indices] = _fields_around(graph, np.asarray(goals, np.int32)[indices], closed)
+    own, barred = own_costs or {}, forbidden or {}
+    alike: dict[tuple[frozenset[int], int], list[int]] = {}
+    for index in {**barred, **own}:
+        key = barred.get(index, frozenset()), id(own.get(index, graph.costs))
+        alike.setdefault(key, []).append(index)
+    for (closed, _), indices in alike.items():
+        other = graph.with_costs(own.get(indices[0], graph.costs))
+        table[indices] = _fields_around(other, np.asarray(goals, np.int32)[indices], closed)
     for index, closed in (forbidden or {}).items():
         kept = [node for node in closed if index >= len(starts) or node != starts[index]]
         table[index, kept] = UNREACHABLE

@@ -159,7 +159,11 @@ class PlanningGraph:
         """The same edges, each with cost 1."""
         if self.is_unweighted:
             return self
-        return PlanningGraph(self.indptr, self.neighbours, np.ones_like(self.costs), self.columns)
+        return self.with_costs(np.ones_like(self.costs))
+
+    def with_costs(self, costs: Ints) -> PlanningGraph:
+        """Return the same edges with other costs, shape (edges,)."""
+        return PlanningGraph(self.indptr, self.neighbours, costs, self.columns)
 
     def edges_from(self, node: int) -> Ints:
         """Return the nodes that can be entered from ``node``."""

@@ -26,10 +26,12 @@ class DijkstraPlanner:
     def plan(self, problem: PlanningProblem) -> JointPlan:
         """Return each robot's cheapest path; a robot without one stays at its start."""
         graph = problem.graph
-        fields = distance_fields(graph, problem.goals, problem.forbidden, problem.starts)
+        own = problem.own_costs or {}
+        fields = distance_fields(graph, problem.goals, problem.forbidden, problem.starts, own)
+        ends = zip(fields, problem.starts, problem.goals, strict=True)
         paths = [
-            _descend(graph, field, int(start), int(goal))
-            for field, start, goal in zip(fields, problem.starts, problem.goals, strict=True)
+            _descend(graph, own.get(robot, graph.costs), field, int(start), int(goal))
+            for robot, (field, start, goal) in enumerate(ends)
         ]
         last = max(map(len, paths), default=1)
         cells = np.empty((last, len(paths)), dtype=np.int32)
@@ -40,7 +42,9 @@ class DijkstraPlanner:
         return JointPlan(cells, complete, conflict_free=False)
 
 
-def _descend(graph: PlanningGraph, field: NDArray[np.int32], start: int, goal: int) -> list[int]:
+def _descend(
+    graph: PlanningGraph, costs: NDArray[np.int32], field: NDArray[np.int32], start: int, goal: int
+) -> list[int]:
     """Follow a distance field from ``start``; among equal nodes the path goes straight on if it can."""
     path = [start]
     if field[start] == UNREACHABLE:
@@ -52,7 +56,7 @@ def _descend(graph: PlanningGraph, field: NDArray[np.int32], start: int, goal: i
         ahead = min(
             range(first, end),
             key=lambda edge: (
-                int(graph.costs[edge]) + int(field[graph.neighbours[edge]]),
+                int(costs[edge]) + int(field[graph.neighbours[edge]]),
                 int(graph.neighbours[edge]) - here != step,
             ),
         )

@@ -31,7 +31,7 @@ from rce_fleet.planning.smoothing import smooth, smoothed
 from rce_fleet.planning.straightening import ends_of, straighten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,7 +107,7 @@ class LacamPlanner:
         while perf_counter() < began + _RESTARTS * problem.seconds:
             seed += _NEXT_SEED
             cells = _another(part, problem, guide, cells, seed)
-        distances = _table(part, steps).astype(np.int32, copy=False)
+        distances = _table(part, steps, {}).astype(np.int32, copy=False)
         improver = Improver(
             steps, distances, cells, part.goals, rotations=problem.rotations, seed=problem.seed
         )
@@ -126,8 +126,8 @@ class LacamPlanner:
         directions = part.edges(edge_directions(problem.graph))
         turning = Turning.of(part.graph.unweighted, directions, part.goals, motion, part.forbidden)
         guided_turning = turning
-        if guide is not part.graph:
-            guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden)
+        if guide is not part.graph or part.own_costs:
+            guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden, part.own_costs)
         best, least = JointPlan(part.original(part.starts[None]), complete=False), float("inf")
         seed = problem.seed
         effort = min(problem.effort, _SMOOTHING * len(part.starts))
@@ -180,9 +180,9 @@ def plan(
     )
 
 
-def _table(part: Compaction, graph: PlanningGraph) -> Table:
-    if part.forbidden:
-        return distance_fields(graph, part.goals, part.forbidden, part.starts)
+def _table(part: Compaction, graph: PlanningGraph, own_costs: Mapping[int, Ints]) -> Table:
+    if part.forbidden or own_costs:
+        return distance_fields(graph, part.goals, part.forbidden, part.starts, own_costs)
     return field_table(graph, part.goals)
 
 
@@ -208,7 +208,12 @@ def _search(
     effort: int = 0,
 ) -> _Found:
     search = ConfigurationSearch(
-        graph, _table(part, graph), part.goals, rotations=problem.rotations, seed=seed, turning=turning
+        graph,
+        _table(part, graph, part.own_costs),
+        part.goals,
+        rotations=problem.rotations,
+        seed=seed,
+        turning=turning,
     )
     rounds = (effort or problem.effort) // len(part.starts)
     cells, complete = search.run(part.starts, rounds, problem.urgency)

@@ -160,6 +160,7 @@ class Turning:
         goals: Ints,
         motion: Motion,
         forbidden: Mapping[int, frozenset[int]] | None = None,
+        own_costs: Mapping[int, Ints] | None = None,
     ) -> Turning:
         """Compute the table.
 
@@ -169,22 +170,36 @@ class Turning:
             goals: Goal of each robot.
             motion: See there.
             forbidden: Nodes that some robots must not enter, by the robot's index.
+            own_costs: Costs of all edges for some robots, by the robot's index.
         """
-        lines = line_graph(graph, directions, motion.costs)
-        edges = len(directions)
         barred = {
             robot: frozenset(np.flatnonzero(np.isin(graph.neighbours, list(nodes))).tolist())
             for robot, nodes in (forbidden or {}).items()
         }
-        found = distance_fields(lines, goals + edges, barred)[:, :edges]
-        # Of each distance one unit leads from the last edge to the goal's own node.
-        own = np.minimum(graph.costs, MAX_COST // UNITS // 2) * UNITS - 1
-        table = np.where(found >= UNREACHABLE, UNREACHABLE, found + own).astype(np.int32)
+        table = _edge_costs(graph, directions, goals, motion, barred)
+        alike: dict[int, list[int]] = {}
+        for robot, costs in (own_costs or {}).items():
+            alike.setdefault(id(costs), []).append(robot)
+        for robots in alike.values():
+            other = graph.with_costs((own_costs or {})[robots[0]])
+            shut = {row: barred[robot] for row, robot in enumerate(robots) if robot in barred}
+            table[robots] = _edge_costs(other, directions, goals[robots], motion, shut)
         headings = [motion.heading(robot) for robot in range(len(goals))]
         active = np.ones(len(goals), np.int32)
         return cls(
             active, np.ascontiguousarray(table), directions, motion.costs, np.array(headings, np.int32)
         )
+
+
+def _edge_costs(
+    graph: PlanningGraph, directions: Ints, goals: Ints, motion: Motion, barred: Mapping[int, frozenset[int]]
+) -> Ints:
+    """Return the cost of each edge and of the way from there to each goal, units, shape (goals, edges)."""
+    edges = len(directions)
+    found = distance_fields(line_graph(graph, directions, motion.costs), goals + edges, barred)[:, :edges]
+    # Of each distance one unit leads from the last edge to the goal's own node.
+    own = np.minimum(graph.costs, MAX_COST // UNITS // 2) * UNITS - 1
+    return np.where(found >= UNREACHABLE, UNREACHABLE, found + own).astype(np.int32)
 
 
 def line_graph(graph: PlanningGraph, directions: Ints, turns: Ints) -> PlanningGraph:

@@ -60,6 +60,8 @@ class PlanningProblem:
             way, the most urgent one drives first. A planner may ignore it.
         lifelong: Whether robots get other goals where they arrive: then what follows a robot's first visit of
             its goal does not count, unless it starts there. A planner may ignore it.
+        own_costs: For some robots the cost of every edge, shape (edges,), by the robot's index; the graph's
+            costs are those of the others. Robots with the same costs share an array. A planner may ignore it.
     """
 
     graph: PlanningGraph
@@ -73,6 +75,7 @@ class PlanningProblem:
     motion: Motion | None = None
     urgency: Ints | None = None
     lifelong: bool = False
+    own_costs: Mapping[int, Ints] | None = None
 
     @classmethod
     def of(
@@ -89,17 +92,21 @@ class PlanningProblem:
         motion: Motion | None = None,
         urgency: Sequence[int] | None = None,
         lifelong: bool = False,
+        own_costs: Mapping[int, Ints] | None = None,
     ) -> PlanningProblem:
         """Return the problem with these starts and goals.
 
         Raises:
             PlanningError: Two robots have the same start or goal, one of them is not a node, or there is not
-                one heading of the motion or one urgency for each robot.
+                one heading of the motion or one urgency for each robot, or one own cost for each edge.
         """
         if len(starts) != len(goals):
             raise PlanningError(f"{len(starts)} starts and {len(goals)} goals: each robot needs one of each")
         if urgency is not None and len(urgency) != len(starts):
             raise PlanningError(f"{len(urgency)} urgencies for {len(starts)} robots: give one for each robot")
+        for robot, costs in (own_costs or {}).items():
+            if len(costs) != len(graph.costs):
+                raise PlanningError(f"robot {robot} has {len(costs)} own costs for {len(graph.costs)} edges")
         for what, cells in (("start", starts), ("goal", goals)):
             first: dict[int, int] = {}
             for robot, cell in enumerate(cells):
@@ -127,6 +134,7 @@ class PlanningProblem:
             motion,
             None if urgency is None else np.array(urgency, dtype=np.int32),
             lifelong,
+            own_costs,
         )
 
 

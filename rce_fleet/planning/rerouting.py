@@ -79,6 +79,7 @@ def reroute(
     effort: int,
     seed: int = 0,
     forbidden: Mapping[int, frozenset[int]] | None = None,
+    own_costs: Mapping[int, Ints] | None = None,
 ) -> Rerouted | None:
     """Return new paths of ``members``, and of robots in their way.
 
@@ -89,6 +90,7 @@ def reroute(
         effort: States of searches that are expanded at most.
         seed: Breaks ties.
         forbidden: Nodes that single robots must not enter.
+        own_costs: Costs of all edges for single robots; those with the same costs share one array.
 
     Returns:
         The new paths; None if not all of them were found.
@@ -101,13 +103,14 @@ def reroute(
     closed_of = [sorted((forbidden or {}).get(robot, ())) for robot in range(count)] if forbidden else []
     closed_at = np.zeros(count + 1, np.int32)
     closed_at[1:] = np.cumsum([len(closed) for closed in closed_of]) if closed_of else 0
+    costs_at, costs = _cost_rows(graph, count, own_costs or {})
     touched = len(members) + TOUCHED
     slots, lengths = np.full(count, -1, np.int32), np.full(touched, PLANNED, np.int32)
     nodes, steps = np.empty((touched, LONGEST), np.int32), np.empty((touched, LONGEST))
     is_free = ~np.isin(robots.rests, robots.goals) & np.isin(robots.rests, graph.neighbours)
     targets = np.where(robots.goals >= 0, robots.goals, np.where(is_free, robots.rests, -1)).astype(np.int32)
     done = reroute_robots(
-        graph.indptr, graph.neighbours, graph.costs, graph.reverse.indptr, graph.reverse.neighbours,
+        graph.indptr, graph.neighbours, costs_at, costs, graph.reverse.indptr, graph.reverse.neighbours,
         robots.starts, robots.begins, robots.goals, targets, closed_at,
         np.array([node for closed in closed_of for node in closed], np.int32),
         routes_at, robots.nodes, robots.steps, robots.clock, effort, np.array(members, np.int32),
@@ -122,3 +125,15 @@ def reroute(
     }
     unreachable = frozenset(robot for robot in paths if robots.goals[robot] >= 0 > targets[robot])
     return Rerouted(paths, unreachable)
+
+
+def _cost_rows(graph: PlanningGraph, count: int, own_costs: Mapping[int, Ints]) -> tuple[Ints, Ints]:
+    """Return the row of costs of each robot, shape (robots,), and these rows, shape (rows, edges)."""
+    rows, row_of = [graph.costs], {id(graph.costs): 0}
+    costs_at = np.zeros(count, np.int32)
+    for robot, costs in own_costs.items():
+        if id(costs) not in row_of:
+            row_of[id(costs)] = len(rows)
+            rows.append(costs)
+        costs_at[robot] = row_of[id(costs)]
+    return costs_at, np.ascontiguousarray(rows, np.int32)

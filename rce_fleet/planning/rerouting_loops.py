@@ -154,6 +154,7 @@ def _take_aside(
 def _reroute(
     indptr: Ints,
     neighbours: Ints,
+    costs_at: Ints,
     costs: Ints,
     back_indptr: Ints,
     back_neighbours: Ints,
@@ -183,7 +184,8 @@ def _reroute(
     Args:
         indptr: The graph.
         neighbours: The graph.
-        costs: Steps that each edge takes at least.
+        costs_at: Row of each robot in ``costs``, shape (robots,).
+        costs: Steps that each edge takes at least, shape (rows, edges).
         back_indptr: The graph with reversed edges.
         back_neighbours: The graph with reversed edges.
         starts: Node of each robot, shape (robots,).
@@ -273,8 +275,9 @@ def _reroute(
             dwell = DWELL if goal >= 0 and target == goal else np.inf
             most = min(_GIVE_UP, effort - work[0])
             length = search_path(
-                indptr, neighbours, costs, fields[slot], start, begin, own, target, dwell, is_goal, most,
-                counts, times, tags, best, marks, mark, states, scores, heap, work, nodes[slot], steps[slot],
+                indptr, neighbours, costs[costs_at[robot]], fields[slot], start, begin, own, target, dwell,
+                is_goal, most, counts, times, tags, best, marks, mark, states, scores, heap, work,
+                nodes[slot], steps[slot],
             )  # fmt: skip
         if length >= 0:
             lengths[slot] = length
@@ -322,7 +325,10 @@ def _reroute(
 
 
 _ROW, _TABLE, _TIMES = "int32[::1]", "int32[:, ::1]", "float64[::1]"
-_GRAPHS, _ROBOTS = ", ".join([_ROW] * 5), f"{_ROW}, {_TIMES}, {_ROW}, {_ROW}, {_ROW}, {_ROW}"
+_GRAPHS, _ROBOTS = (
+    ", ".join([_ROW] * 3 + [_TABLE] + [_ROW] * 2),
+    f"{_ROW}, {_TIMES}, {_ROW}, {_ROW}, {_ROW}, {_ROW}",
+)
 _SEARCH = f"float64, int64, {_ROW}"
 _LISTS = f"{_ROW}, float64[:, :, ::1], int32[:, :, ::1]"
 reroute_robots = kernel(

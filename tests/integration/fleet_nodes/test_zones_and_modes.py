@@ -42,7 +42,7 @@ async def test_zones_and_modes_are_set_by_services() -> None:
         answer = await call(node, "set_zones", zones=[spill], revision=0)
         assert not answer.ok
         answer = await call(node, "set_zones", zones=[{"id": "a", "kind": "icy"}], revision=-1)
-        assert "kind must be one of blocked, slow, one_way, limited, not 'icy'" in answer.message
+        assert "kind must be one of blocked, slow, one_way, limited, cost, not 'icy'" in answer.message
         state = (await call(node, "get_state")).state
         assert [(zone.id, list(zone.cells), zone.reason, zone.by) for zone in state.zones] == [
             ("spill", [5, 6], "oil", "anna")

@@ -283,6 +283,7 @@ def put_zone(fleet: SimulatedClients, rng: Random) -> None:
             Zone(name, ZoneKind.BLOCKED, cells, robots=("Robot1", "Robot2")),
             Zone(name, ZoneKind.ONE_WAY, cells, direction=rng.choice(list(Direction))),
             Zone(name, ZoneKind.SLOW, cells, speed=0.2),
+            Zone(name, ZoneKind.COST, cells, robots=("Robot1", "Robot3"), cost=7.0),
             Zone(name, ZoneKind.LIMITED, cells, capacity=1),
         ]
     )

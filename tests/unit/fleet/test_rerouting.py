@@ -160,6 +160,20 @@ def test_standing_robot_in_an_aisle_makes_way_first() -> None:
     assert [ledger.route(name(robot)) for robot in (0, 1)] == [[goals[0]], [goals[1]]]
 
 
+def test_own_costs_lead_one_robot_around() -> None:
+    """Two robots with the same short way; cells of it are dear for the first one."""
+    grid = GridMap(3, 9, blocked=frozenset(range(10, 17)))
+    graph = PlanningGraph.from_grid(grid)
+    dear = np.ones(27, np.int32)
+    dear[3:6] = 5
+    own = {0: PlanningGraph.from_grid(grid, costs=dear).costs}
+    robots = routed([9, 1], [8, 7], [[(9, 0.0)], [(1, 0.0)]])
+    found = reroute(graph, robots, (0, 1), effort=10_000, own_costs=own)
+    assert found is not None
+    assert 22 in found.paths[0][0]
+    assert 4 in found.paths[1][0]
+
+
 def test_compiled_and_plain_loops_find_the_same_paths() -> None:
     """Both forms of the loops find the same paths."""
     if not is_available():

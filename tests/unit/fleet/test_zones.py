@@ -213,6 +213,8 @@ def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
         (Zone("a", ZoneKind.LIMITED, (1,), capacity=2**31 - 1), "capacity of 1 .. 1000000, not 2147483647"),
         (Zone("a", ZoneKind.ONE_WAY, (1,)), "needs a direction"),
         (Zone("a", ZoneKind.LIMITED, (1,)), "capacity of 1 .. 1000000, not 0"),
+        (Zone("a", ZoneKind.COST, (1,)), "a metre counts 1 .. 1e.06, not 0.0"),
+        (Zone("a", ZoneKind.COST, (1,), cost=float("nan")), "not nan"),
         (Zone("a", ZoneKind.SLOW, (1,), ((0, 1),), speed=1.0), "only a blocked zone has edges"),
     ],
 )
@@ -225,4 +227,66 @@ def test_the_slowest_zone_has_a_cost() -> None:
     """A planner takes no such zone any more; its costs are finite all the same."""
     book = ZoneBook()
     book.put([Zone("a", ZoneKind.SLOW, (1,), speed=1e-320), Zone("b", ZoneKind.SLOW, (2,), speed=100.0)])
-    assert book.costs() == {1: 20, 2: 1}
+    assert book.costs() == {1: 20}
+
+
+def test_costs_are_shared_by_robots_with_the_same_zones() -> None:
+    book = ZoneBook()
+    book.put(
+        [
+            Zone("all", ZoneKind.COST, (1,), cost=2.5),
+            Zone("two", ZoneKind.SLOW, (1, 2), robots=("A", "B"), speed=0.1),
+            Zone("none", ZoneKind.COST, (3,), robots=("C",), cost=1.0),
+        ]
+    )
+    assert book.costs() == book.costs_of("C") == {1: 3}
+    assert book.costs_of("A") == {1: 5, 2: 5}
+    assert book.costs_of("A") is book.costs_of("B")
+    assert book.costs_of("C") is book.costs()
+    book.put([], ["two"])
+    assert book.costs_of("A") == {1: 3}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        FleetSettings(repairs=24),
+        FleetSettings(repairs=1),
+        FleetSettings(repairs=0),
+        FleetSettings(repairs=0, quarter_turn=1.0, stop=0.5),
+        FleetSettings(planner="dijkstra"),
+    ],
+    ids=["one by one", "beside", "for all", "with turns", "dijkstra"],
+)
+@pytest.mark.parametrize(
+    "zone",
+    [
+        Zone("z", ZoneKind.SLOW, (3, 4, 5), robots=("Robot1",), speed=0.1),
+        Zone("z", ZoneKind.COST, (3, 4, 5), robots=("Robot1",), cost=5.0),
+    ],
+    ids=["slow", "cost"],
+)
+def test_zone_for_one_robot_costs_only_this_one(
+    make_fleet: type[SimulatedClients], settings: FleetSettings, zone: Zone
+) -> None:
+    """The other one's short way leads through it."""
+    fleet = make_fleet(FleetPlanner(LOOP, settings), [9, 1], 1, loss=0.0)
+    fleet.send([])
+    fleet.run(lambda: len(fleet.planner.snapshot().robots) == 2)
+    put(fleet, zone)
+    for name, goal in (("Robot1", 8), ("Robot2", 7)):
+        assert fleet.ask(GoalSet(name, goal)).ok
+    fleet.run(lambda: len(robot(fleet, 1).plan) > 5 and len(robot(fleet, 2).plan) > 3)
+    assert 22 in robot(fleet, 1).plan
+    assert 4 in robot(fleet, 2).plan
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_cost_zone_is_avoided_by_all(make: Make) -> None:
+    fleet = make(LOOP, [0], [])
+    put(fleet, Zone("mud", ZoneKind.COST, (3, 4, 5), cost=5.0))
+    assert fleet.ask(GoalSet("Robot1", 8)).ok
+    fleet.run(lambda: len(robot(fleet).plan) > 5)
+    assert 22 in robot(fleet).plan
+    assert fleet.planner.state.zones.speed_limit("Robot1", [3, 4, 5]) == inf
+    fleet.run(fleet.all_arrived)

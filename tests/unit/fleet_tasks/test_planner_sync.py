@@ -269,12 +269,22 @@ def test_another_grid_brings_the_planners_zones() -> None:
         Zone("ice", "slow", (3,), 0.2, robots=("Robot1",)),
         Zone("lane", "one_way", (3, 4), -pi / 2),
         Zone("lift", "limited", (3, 4), 2.0),
+        Zone("mud", "cost", (3, 4), 2.5, robots=("Robot1",)),
     ],
 )
 def test_zones_are_the_same_after_the_wire(zone: Zone) -> None:
     kept = checked(zone, GridMap(), 1000.0)
     back = read_zone(zone_fields(kept, 1000.0), 1000.0)
     assert back == kept
+
+
+def test_a_cost_zone_is_sent_to_the_planner() -> None:
+    both = Both()
+    both.book.emit(Zone("mud", "cost", (2,), 5.0), "zone", 0.0)
+    (call,) = both.step()
+    assert isinstance(call, SetZone)
+    assert call.zone == both.book.zones["mud"]
+    assert not both.step()
 
 
 def test_ways_lead_around_a_robots_forbidden_cells() -> None:

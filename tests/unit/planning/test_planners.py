@@ -13,6 +13,7 @@ from rce_fleet.planning.dijkstra import distances
 from rce_fleet.planning.fields import UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import Lane, PlanningGraph
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import JointPlan, PlanningProblem, load_planner, planner_names
 
 
@@ -66,6 +67,31 @@ def test_closed_moves_and_costs_change_the_path() -> None:
     assert distance_fields(closed, [2])[0, 0] == 4
     assert distance_fields(slow, [2])[0, 0] == 4
     assert distance_fields(closed, [0])[0, 2] == 2
+
+
+@pytest.mark.parametrize("planner", ["lacam", "dijkstra"])
+@pytest.mark.parametrize("forbidden", [None, {1: frozenset({13})}], ids=["open", "forbidden"])
+@pytest.mark.parametrize("motion", [None, Motion(1.0, 0.5)], ids=["steps", "turns"])
+def test_own_costs_change_the_path_of_one_robot(
+    planner: str, forbidden: dict[int, frozenset[int]] | None, motion: Motion | None
+) -> None:
+    """Two robots with the same short way along a wall; cells of it are dear for the first one."""
+    grid = GridMap(3, 9, blocked=frozenset(range(10, 17)) - {13})
+    dear = np.ones(27, np.int32)
+    dear[[3, 4, 5, 13]] = 9
+    graph = PlanningGraph.from_grid(grid)
+    own = {0: PlanningGraph.from_grid(grid, costs=dear).costs}
+    problem = PlanningProblem.of(graph, [9, 1], [8, 7], forbidden=forbidden, own_costs=own, motion=motion)
+    joint = load_planner(planner).plan(problem)
+    assert joint.complete
+    assert 22 in joint.path(0)
+    assert 4 in joint.path(1)
+
+
+def test_own_costs_are_those_of_all_edges() -> None:
+    graph = PlanningGraph.from_grid(GridMap(2, 2))
+    with pytest.raises(PlanningError, match="robot 0 has 3 own costs for 8 edges"):
+        PlanningProblem.of(graph, [0], [3], own_costs={0: np.ones(3, np.int32)})
 
 
 def test_fields_are_the_distances_of_the_grid() -> None:
