@@ -13,7 +13,7 @@ from rce.model import MEGABYTE, MIN_MEMORY, Resources, write_cores, write_memory
 from rce_master.usage import STEP_S, WINDOW_S, History, rates_between
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rce_master.state.placement import Room
 
@@ -133,22 +133,78 @@ def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Adv
             yield Advice("too large", text, f"rce resize {tag} --size {better_size}")
 
 
-def for_machine(room: Room, others: list[Room]) -> list[Advice]:
+class Movable(NamedTuple):
+    """A container that can be moved without others."""
+
+    user: str
+    tag: str
+    requested: Resources
+
+
+def for_machine(room: Room, others: Sequence[Room], containers: Iterable[Movable] = ()) -> list[Advice]:
     """Return advice on whether a machine is too full.
 
     Args:
         room: The machine.
         others: The other machines.
+        containers: Containers of the machine that may be moved.
     """
-    full = {name: share for name, share in room.shares.items() if share > NEARLY_FULL}
-    if not full or room.draining:
+    if not is_too_full(room):
         return []
+    full = {name: share for name, share in room.shares.items() if share > NEARLY_FULL}
     text = " and ".join(f"{share:.0%} of its {name}" for name, share in full.items()) + " are promised"
-    relief = min((other for other in others if not other.draining), key=lambda r: r.load, default=None)
+    open_ = [other for other in others if not other.draining]
+    move = min(_moves(room, open_, containers), default=None)
+    if move is not None:
+        return [move.advice(text)]
+    relief = min(open_, key=lambda r: r.load, default=None)
     if relief is None or relief.load > NEARLY_FULL:
         return [Advice("too full", f"{text}, and no machine is emptier: add one", "rce-container MASTER_IP")]
     text += f"; new containers go to {relief.name}, and smaller ones make room here"
     return [Advice("too full", text, "rce top --sort memory")]
+
+
+def is_too_full(room: Room) -> bool:
+    """Return whether more of a machine is promised than should be; a machine that is emptied is no matter."""
+    return not room.draining and _fullest(room) > NEARLY_FULL
+
+
+class _Move(NamedTuple):
+    """A move that relieves a machine; the better one is less."""
+
+    left: float
+    """What is promised of what the machine is shortest of then; 0: enough is free."""
+    moved: float
+    """Share of the machine that moves."""
+    load: float
+    """Of the other machine, then."""
+    user: str
+    tag: str
+    machine: str
+
+    def advice(self, text: str) -> Advice:
+        text += (
+            f"; {self.machine} has room for {self.user}/{self.tag}, and is {self.load:.0%} full with it"
+            " (what its nodes hold in memory only is lost)"
+        )
+        return Advice("too full", text, f"rce move {self.tag} {self.machine} --user {self.user}")
+
+
+def _moves(room: Room, others: Sequence[Room], containers: Iterable[Movable]) -> Iterator[_Move]:
+    """Give the moves after which the other machine is not too full."""
+    before = _fullest(room)
+    for user, tag, requested in containers:
+        left = _fullest(room.without(requested))
+        moved = before - left
+        if moved <= 0:  # it takes nothing of what the machine is short of
+            continue
+        for other in others:
+            if other.fits(requested) and (load := other.load_with(requested)) <= NEARLY_FULL:
+                yield _Move(left if left > NEARLY_FULL else 0.0, moved, load, user, tag, other.name)
+
+
+def _fullest(room: Room) -> float:
+    return max(room.shares.values(), default=0.0)
 
 
 def _steps(value: float, step: float) -> float:

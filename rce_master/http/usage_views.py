@@ -8,8 +8,11 @@ from heapq import nsmallest
 from typing import TYPE_CHECKING
 
 from rce.control import EndpointUsage, NodeStatus, NodeUsage
+from rce.model import Network
 from rce_master import advice
 from rce_master.http import usage_models as models
+from rce_master.state.lifecycle import ContainerPhase
+from rce_master.state.records import Container
 from rce_master.usage import NO_RATES, History, UsageBook
 
 if TYPE_CHECKING:
@@ -17,11 +20,12 @@ if TYPE_CHECKING:
 
     from rce_master.advice import Advice
     from rce_master.state.placement import Room
-    from rce_master.state.records import Container
     from rce_master.state.tables import Tables
 
 _PIECE = 200
 """Containers of a machine between two turns of the event loop."""
+_MOST_MOVABLE = 100
+"""Containers of a machine that advice looks at."""
 _NOTHING = EndpointUsage()
 _NO_NODE_USAGE = NodeUsage()
 
@@ -101,11 +105,15 @@ class UsageViews:
 
     async def _machine(self, room: Room, others: list[Room]) -> models.MachineUsageOut:
         cpu, memory = 0.0, 0
+        movable: list[advice.Movable] = []
+        is_full = advice.is_too_full(room)
         for number, id_ in enumerate(list(self._tables.endpoints.keys("task_set", room.process)), 1):
             history = self._book.history(room.process, id_)
             if history is not None:
                 cpu += history.rates.cpu
                 memory += history.now.usage.memory
+            if is_full and len(movable) < _MOST_MOVABLE and (one := self._movable(id_)) is not None:
+                movable.append(one)
             if number % _PIECE == 0:
                 await asyncio.sleep(0)
         await asyncio.sleep(0)
@@ -123,8 +131,22 @@ class UsageViews:
             memory=room.machine.memory,
             promised_memory=room.memory,
             memory_used=memory,
-            advice=_shown(advice.for_machine(room, others)),
+            advice=_shown(advice.for_machine(room, others, movable)),
         )
+
+    def _movable(self, id_: str) -> advice.Movable | None:
+        """Return a container that can move by itself; None if it cannot, or is no container.
+
+        Those in a network of a group move with others, and those with volumes need a disk, too.
+        """
+        tables, container = self._tables, self._tables.endpoints.get(id_)
+        if not isinstance(container, Container) or container.resources.volumes:
+            return None
+        if container.resources.network is Network.GROUP or tables.moves.get(id_) is not None:
+            return None
+        if tables.container_live(id_).phase is not ContainerPhase.RUNNING:
+            return None
+        return advice.Movable(container.user, container.tag, container.resources)
 
 
 def _node(tag: str, status: NodeStatus | None, history: History | None) -> models.NodeUsageOut:

@@ -12,12 +12,13 @@ from support.parts import ResourceParts
 from rce.control.messages import MachineInfo, Usage
 from rce.control.model import EndpointUsage, NodeUsage
 from rce.model.specs import Resources
-from rce_master.advice import Advice, for_container, for_machine
+from rce_master.advice import Advice, Movable, for_container, for_machine
 from rce_master.state.placement import Room
 from rce_master.usage import STEP_S, WINDOW_S, History, UsageBook
 
 MB = 1 << 20
 ID = "anna/c"
+LABELLED = Resources(memory=20 * MB, special_features=("gpu",))
 
 
 class CpuCounters(TypedDict):
@@ -179,6 +180,41 @@ def test_a_machine_that_is_nearly_promised_away_is_too_full() -> None:
     assert advice.text.startswith("100% of its slots are promised; new containers go to m2")
     assert for_machine(full, [])[0].command == "rce-container MASTER_IP"
     assert for_machine(empty, [full]) == []
+
+
+def movable(tag: str, **requested: Unpack[ResourceParts]) -> Movable:
+    return Movable("anna", tag, Resources(**requested))
+
+
+def test_a_container_is_to_leave_a_machine_that_is_too_full() -> None:
+    """The smallest one that leaves enough free, or the one that leaves most."""
+    full = Room(process="c1", machine=MachineInfo(name="m1", memory=1000 * MB), memory=960 * MB)
+    room = Room(process="c2", machine=MachineInfo(name="m2", memory=1000 * MB), memory=500 * MB)
+    containers = [movable("large", memory=390 * MB), movable("enough", memory=70 * MB)]
+    few = [movable("tiny", memory=10 * MB), movable("small", memory=30 * MB)]
+    assert for_machine(full, [room], [*few, *containers]) == [
+        Advice(
+            "too full",
+            "96% of its memory are promised; m2 has room for anna/enough, and is 57% full with it"
+            " (what its nodes hold in memory only is lost)",
+            "rce move enough m2 --user anna",
+        )
+    ]
+    (advice,) = for_machine(full, [room], few)
+    assert advice.command == "rce move small m2 --user anna"
+
+
+def test_no_move_is_advised_that_only_shifts_the_problem() -> None:
+    full = Room(process="c1", machine=MachineInfo(name="m1", memory=1000 * MB), memory=960 * MB)
+    other = Room(process="c2", machine=MachineInfo(name="m2", memory=1000 * MB), memory=850 * MB)
+    drained = Room(process="c3", machine=MachineInfo(name="m3", memory=1000 * MB), draining=True)
+    containers = [movable("enough", memory=70 * MB), Movable("anna", "labelled", LABELLED)]
+    (advice,) = for_machine(full, [other, drained], containers)
+    assert advice.command == "rce top --sort memory"
+    slots = Room(process="c1", machine=MachineInfo(name="m1", slots=10, memory=1000 * MB), slots=10)
+    room = Room(process="c2", machine=MachineInfo(name="m2", slots=10))
+    (advice,) = for_machine(slots, [room], [movable("one", size=2)])
+    assert advice.command == "rce move one m2 --user anna"
 
 
 @given(

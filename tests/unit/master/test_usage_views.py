@@ -5,15 +5,20 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, cast
 
+from support.master_world import World
+
 from rce.control.messages import MachineInfo, Usage
 from rce.control.model import EndpointUsage
+from rce.model.specs import Network
 from rce_master.http.usage_views import UsageViews
+from rce_master.state import commands
 from rce_master.state.placement import Room
 from rce_master.usage import UsageBook
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+MB = 1 << 20
 CONTAINERS = [f"anna/c{number}" for number in range(2000)]
 
 
@@ -49,3 +54,20 @@ async def test_others_have_their_turns_while_usage_is_added_up() -> None:
     assert (first.memory_used, second.memory_used) == (3 * len(CONTAINERS), 0)
     assert (first.connected, second.connected) == (True, False)
     assert turns >= 10
+
+
+async def test_a_machine_that_is_too_full_names_a_container_to_move() -> None:
+    """One that runs, moves alone, and is not moving already."""
+    world = World()
+    world.container_set("c1", name="m1", memory=1000 * MB, networks=("group",))
+    for tag in ("a_moving", "a_grouped", "a_starts", "b", "c"):
+        network = Network.GROUP if tag == "a_grouped" else Network.NONE
+        world.container(tag, memory=190 * MB, network=network, group="g" if tag == "a_grouped" else "")
+        if tag != "a_starts":
+            world.run(tag)
+    world.container_set("c2", name="m2", memory=1000 * MB)
+    world.do(commands.MoveContainer(user="anna", tag="a_moving", machine="m2"))
+    views = UsageViews(world.state.tables, UsageBook(lambda: 1.0))
+    first, second = await views.machines()
+    assert [advice.command for advice in first.advice] == ["rce move b m2 --user anna"]
+    assert second.advice == []
