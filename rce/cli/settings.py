@@ -145,7 +145,10 @@ class SettingsOptions:
         """Return the parameters for Typer."""
         declared = [option.declare(panel=self._panel(option)) for option in self.options]
         if self._master:
-            help_ = "Host or address of the master [master_host of the settings file]."
+            help_ = (
+                "Host or address of the master, HOST or HOST:PORT; of several masters, all of them separated"
+                " by commas [master_host of the settings file, also a list]."
+            )
             declared.insert(
                 0, _parameter("master", str | None, typer.Argument(metavar=MASTER_IP, help=help_))
             )

@@ -59,6 +59,8 @@ class Setting:
     """Text on the effect while it is not set, where the default does not show it."""
     example: str = ""
     """A value for the shipped file, where the default is none or depends on the machine."""
+    alias: str = ""
+    """Another key of the settings file that means the same; empty: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,14 +208,18 @@ def read_section(
         faults.append(Fault(place, f"must be a mapping, found {data!r:.40}"))
         return {}
     fields, inner = fields_of(section), sections_of(section)
+    names = {field.setting.alias: name for name, field in fields.items() if field.setting.alias}
     chosen: dict[str, Any] = {}
     for key, value in data.items():
         here = join(place, key)
         if key in inner:
             chosen[key] = read_section(inner[key], value, here, faults)
-        elif key in fields:
+        elif (name := names.get(key, key)) in fields:
+            if name != key and name in data:
+                faults.append(Fault(here, f"means the same as {name}; give one of them"))
+                continue
             try:
-                chosen[key] = fields[key].read(value)
+                chosen[name] = fields[name].read(value)
             except SettingError as error:
                 faults.append(Fault(here + error.place, str(error)))
         elif key not in others:
@@ -277,6 +283,10 @@ def _read_host(value: Any) -> Any:
 
 
 def _read_hosts(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        if not value or not all(isinstance(host, str) and split_addresses(host) == (host,) for host in value):
+            raise ValueError(f"must be a list of HOST or HOST:PORT, found {value!r:.60}")
+        value = ",".join(value)
     for host in split_addresses(value) if isinstance(value, str) else [value]:
         _read_host(split_port(host, 1)[0] if isinstance(host, str) else host)
     return value
@@ -328,7 +338,7 @@ def _same(value: Any) -> Any:
 Host = Annotated[str, Reader(_read_host, _same, "HOST")]
 """A host name or an IP address; empty for none."""
 Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST[:PORT],...")]
-"""As :data:`Host`, or several, separated by commas."""
+"""As :data:`Host`, or several, separated by commas or as a list."""
 Store = Annotated[str, Reader(_read_store, _same, "STORE")]
 """Where the master's state is, as :func:`rce.config.store_address.read_store_address` reads it."""
 Networks = Annotated[tuple[str, ...], Reader(_read_network, _same, "ADDRESS")]

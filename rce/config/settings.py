@@ -117,9 +117,11 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     master_host: Annotated[
         Hosts,
         Setting(
-            "Where robot and container task sets find the master; several by commas, used in turn; with"
-            " their control ports, or with `control_port` of the section `master`.",
+            "Where robot and container task sets find the master; several, used in turn, by commas or as a"
+            " list; with their control ports, or with `control_port` of the section `master`. The key"
+            " `masters` means the same.",
             option="",
+            alias="masters",
             unset="the argument MASTER_IP; 127.0.0.1 with `rce up`",
             example="10.0.0.1",
         ),

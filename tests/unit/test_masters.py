@@ -95,6 +95,15 @@ def test_a_clients_file_names_one_or_several_masters() -> None:
 def test_task_sets_settings_name_one_or_several_masters() -> None:
     assert read_document({"master_host": "one,10.0.0.2"}, "file")["master_host"] == "one,10.0.0.2"
     assert read_document({"master_host": "one:81,[::1]:82"}, "file")["master_host"] == "one:81,[::1]:82"
+    listed = read_document({"master_host": ["one:81", "[::1]:82"]}, "file")
+    assert listed["master_host"] == "one:81,[::1]:82"
+    assert read_document({"masters": ["one", "two"]}, "file") == {"master_host": "one,two"}
+    assert read_document({"masters": "one"}, "file") == {"master_host": "one"}
+    with pytest.raises(ConfigError, match="masters: means the same as master_host; give one of them"):
+        read_document({"masters": ["one"], "master_host": "one"}, "file")
+    for wrong in ([], ["one", 7], ["one,two"], [["one"]], 7):
+        with pytest.raises(ConfigError, match="masters: must be"):
+            read_document({"masters": wrong}, "file")
     with pytest.raises(ConfigError, match="must be HOST or HOST:PORT"):
         read_document({"master_host": "one:port"}, "file")
     with pytest.raises(ConfigError, match="must be a host name"):
