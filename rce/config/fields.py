@@ -212,9 +212,10 @@ def read_section(
     chosen: dict[str, Any] = {}
     for key, value in data.items():
         here = join(place, key)
+        name: Any = names.get(key, key)
         if key in inner:
             chosen[key] = read_section(inner[key], value, here, faults)
-        elif (name := names.get(key, key)) in fields:
+        elif name in fields:
             if name != key and name in data:
                 faults.append(Fault(here, f"means the same as {name}; give one of them"))
                 continue
