@@ -53,3 +53,21 @@ async def test_connection_finds_the_next_leader(folder: Path) -> None:
 
                 await until(is_made, timeout=TIMEOUT_S, what="the container is made")
             await robot.remove_all()
+
+
+async def test_a_robot_connects_through_a_stand_by(folder: Path) -> None:
+    """It knows the address of a stand-by only, which has the leading master hand the endpoint out."""
+    async with (
+        cluster(folder / "etcd", 1) as etcd,
+        masters(folder / "masters", etcd.store, count=2, lease=20.0) as all_,
+        task_sets(folder, all_, robots=1),
+    ):
+        leader = await all_.leader()
+        (standby,) = (master for master in all_.all if master is not leader)
+        async with (
+            Connection(standby.url, DEV_USER, DEV_USER, "robot") as robot,
+            Caller.calling(robot) as caller,
+        ):
+            await caller.wait_for_answers()
+            await robot.remove_all()
+        assert (await standby.health())["role"] == "standby", "the lead changed: it was no stand-by"
