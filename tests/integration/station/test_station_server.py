@@ -120,7 +120,11 @@ async def test_reads_the_fleet(running: RunningStation) -> None:
         ("webhooks?limit=3", "", "query parameter 'limit' is unknown here; known are: none"),
         ("figures?second=60", "", "query parameter 'second' is unknown here; known are: seconds"),
         ("fleet?robot=Robot1", "", "query parameter 'robot' is unknown here; known are: none"),
-        ("tasks?states=open", "", "known are: cursor, limit, order, requester, robot, state"),
+        (
+            "tasks?states=open",
+            "",
+            "known are: cursor, deadline_before, limit, order, requester, robot, state",
+        ),
         ("tasks?state=open&state=ended", "", "query parameter 'state' is given 2 times; give it once"),
         ("events?task=7", "text/event-stream", "known are: after, id, limit"),
         ("events?id=7", "text/event-stream", "a stream of events takes no 'id'"),
