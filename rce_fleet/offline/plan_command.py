@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,12 +15,19 @@ import typer
 
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError, PlanningError
+from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.fields import LANES, UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.lacam import LacamPlanner
 from rce_fleet.planning.lifelong import LIFELONG_KERNELS, LifelongPlanner, LifelongSettings
 from rce_fleet.planning.movingai import read_map, read_scenario
-from rce_fleet.planning.planner import DEFAULT_EFFORT, JointPlan, PlanningProblem, load_planner
+from rce_fleet.planning.planner import (
+    DEFAULT_EFFORT,
+    DEFAULT_PLANNER,
+    JointPlan,
+    PlanningProblem,
+    load_planner,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,8 +43,10 @@ def plan(
     output: Annotated[Path, typer.Option(help="JSON file for the plan.", show_default=False)],
     robots: Annotated[int, typer.Option(min=1, help="Number of robots.")],
     scen: Annotated[Path | None, typer.Option(help="MovingAI scenario: starts and goals.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Time to plan; 0 ends with the first plan.")] = 0.0,
-    planner: Annotated[str, typer.Option(help="Planner, by its name.")] = "lacam",
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Time to plan; 0 (default): end with the first plan.")
+    ] = None,
+    planner: Annotated[str | None, typer.Option(help="Planner, by its name; lacam by default.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of random choices.")] = 0,
     *,
     lifelong: Annotated[
@@ -50,11 +60,16 @@ def plan(
     """
     with _errors():
         if lifelong:
+            unused = {"--scen": scen, "--seconds": seconds, "--planner": planner}
+            if given := [name for name, value in unused.items() if value is not None]:
+                raise PlanningError(
+                    f"--lifelong has starts, goals and a planner of its own; leave out {', '.join(given)}"
+                )
             report = _lifelong(read_map(map_), robots, steps, seed)
         elif scen is None:
             raise PlanningError("a plan needs --scen FILE.scen with starts and goals, or --lifelong")
         else:
-            report = _one_shot(map_, scen, robots, seconds, planner, seed)
+            report = _one_shot(map_, scen, robots, seconds or 0.0, planner or DEFAULT_PLANNER, seed)
         output.write_text(json.dumps(report, separators=(",", ":")) + "\n", encoding="utf-8")
     shown = {name: value for name, value in report.items() if not isinstance(value, list)}
     typer.echo(f"{output}: " + ", ".join(f"{name} {value}" for name, value in shown.items()))
@@ -65,7 +80,7 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
     found: list[float] = []
     began = time.perf_counter()
     planner = load_planner(name)
-    if name == "lacam":
+    if name == DEFAULT_PLANNER:
         planner = LacamPlanner(on_first=lambda _: found.append(time.perf_counter()))
     compile_s = time.perf_counter() - began
     grid = read_map(map_)
@@ -93,6 +108,16 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
         raise PlanningError(
             f"no plan was found in {found[-1] - began:.1f} s; try more --seconds or another --seed"
         )
+    paths = _paths(joint)
+    faults = check_plan(grid, paths, starts=problem.starts.tolist(), goals=problem.goals.tolist())
+    if faults and joint.conflict_free:
+        raise PlanningError(f"the planner {name!r} made a wrong plan; {faults[0]}")
+    if faults:
+        typer.echo(
+            f"rce plan: the planner {name!r} plans each robot alone: {len(faults)} conflicts, the first in"
+            f" {faults[0]}",
+            err=True,
+        )
     return {
         "robots": robots,
         "compile_s": round(compile_s, 4),
@@ -100,7 +125,8 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
         "cost": joint.cost,
         "lower_bound": bound,
         "makespan": joint.makespan,
-        "paths": _paths(joint),
+        "conflict_free": not faults,
+        "paths": paths,
     }
 
 
@@ -150,23 +176,49 @@ def _lifelong(grid: GridMap, robots: int, steps: int, seed: int) -> dict[str, An
     planner = LifelongPlanner(
         PlanningGraph.from_grid(grid), starts, next_goal, seed=seed, settings=LifelongSettings()
     )
-    rows = [planner.cells]
+    rows, reached = [planner.cells], np.zeros((2, robots), np.int64)
+    """Number of goals that each robot has reached, and the step of the last one."""
     first_s = 0.0
-    for _ in range(steps):
+    for step in range(1, steps + 1):
         planner.step()
         rows.append(planner.cells)
+        counts = np.fromiter(map(len, planner.goals), np.int64, robots)
+        reached[:] = counts, np.where(counts > reached[0], step, reached[1])
         first_s = first_s or time.perf_counter() - began
-    tasks = sum(map(len, planner.goals))
+    took = time.perf_counter() - began
+    paths = np.stack(rows, axis=1).tolist()
+    if faults := check_plan(grid, paths, starts=starts.tolist()):
+        raise PlanningError(f"the lifelong planner made a wrong plan; {faults[0]}")
+    tasks = int(reached[0].sum())
     return {
         "robots": robots,
         "compile_s": round(compile_s, 4),
         "first_solution_s": round(first_s, 4),
-        "seconds_per_step": round((time.perf_counter() - began) / steps, 4),
+        "cost": int(reached[1].sum()),
+        "lower_bound": _shortest_legs(PlanningGraph.from_grid(grid), starts.tolist(), planner.goals),
+        "makespan": int(reached[1].max()),
+        "conflict_free": True,
+        "seconds_per_step": round(took / steps, 4),
         "tasks": tasks,
         "tasks_per_step": tasks / steps,
         "goals": planner.goals,
-        "paths": np.stack(rows, axis=1).tolist(),
+        "paths": paths,
     }
+
+
+def _shortest_legs(graph: PlanningGraph, starts: list[int], goals: list[list[int]]) -> int:
+    """Return the sum of the shortest distances from each robot's start to the goals that it reached."""
+    befores: dict[int, list[int]] = {}
+    for start, own in zip(starts, goals, strict=True):
+        for before, goal in pairwise((start, *own)):
+            befores.setdefault(goal, []).append(before)
+    ends = sorted(befores)
+    total = 0
+    for begin in range(0, len(ends), LANES):
+        block = ends[begin : begin + LANES]
+        for goal, field in zip(block, distance_fields(graph, block), strict=True):
+            total += int(field[befores[goal]].sum(dtype=np.int64))
+    return total
 
 
 def _largest_part(grid: GridMap) -> list[int]:

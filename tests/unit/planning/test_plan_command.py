@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from rce_fleet.offline.plan_command import plan
 from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.independent import DijkstraPlanner
 from rce_fleet.planning.lacam import LacamPlanner
 from rce_fleet.planning.movingai import read_map
 
@@ -42,7 +44,8 @@ def test_a_plan_is_written_and_is_right(files: tuple[Path, Path], tmp_path: Path
     assert code == 0, said
     report = json.loads(output.read_text())
     assert list(report) == [
-        "robots", "compile_s", "first_solution_s", "cost", "lower_bound", "makespan", "paths",
+        "robots", "compile_s", "first_solution_s", "cost", "lower_bound", "makespan", "conflict_free",
+        "paths",
     ]  # fmt: skip
     starts = [y * 6 + x for x, y, _, _ in ROWS]
     goals = [y * 6 + x for _, _, x, y in ROWS]
@@ -59,6 +62,8 @@ def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path
     report = json.loads(output.read_text())
     assert {len(path) for path in report["paths"]} == {31}
     assert check_plan(read_map(map_), report["paths"]) == []
+    assert report["conflict_free"]
+    assert 0 < report["lower_bound"] <= report["cost"] <= 3 * report["makespan"] <= 3 * 30
     assert report["tasks"] == sum(map(len, report["goals"]))
     assert report["tasks_per_step"] == pytest.approx(report["tasks"] / 30)
     for path, goals in zip(report["paths"], report["goals"], strict=True):
@@ -68,12 +73,45 @@ def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path
             at = path.index(goal, at)
 
 
+def test_conflicts_of_shortest_paths_are_told(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """Two robots that change places in an aisle: each one's path is right, both together are not."""
+    map_, scen = tmp_path / "lane.map", tmp_path / "lane.scen"
+    map_.write_text("type octile\nheight 1\nwidth 4\nmap\n....\n")
+    scen.write_text("version 1\n0\tlane.map\t4\t1\t0\t0\t3\t0\t3\n0\tlane.map\t4\t1\t3\t0\t0\t0\t3\n")
+    output = tmp_path / "plan.json"
+    code, said = run(map_, "--scen", scen, "--robots", 2, "--planner", "dijkstra", "--output", output)
+    assert code == 0
+    assert "rce plan: the planner 'dijkstra' plans each robot alone: 1 conflicts, the first in step 2" in said
+    assert json.loads(output.read_text())["conflict_free"] is False
+
+
+def test_a_wrong_plan_is_not_written(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a planner that promises plans without conflicts."""
+    plan_alone = DijkstraPlanner().plan
+    monkeypatch.setattr(
+        LacamPlanner, "plan", lambda _, problem: replace(plan_alone(problem), conflict_free=True)
+    )
+    map_, scen = files
+    scen.write_text("version 1\n0\tf\t6\t4\t0\t0\t5\t0\t5\n0\tf\t6\t4\t5\t0\t0\t0\t5\n")
+    code, said = run(map_, "--scen", scen, "--robots", 2, "--output", tmp_path / "plan.json")
+    assert code == 1
+    assert "the planner 'lacam' made a wrong plan; step 3:" in said
+    assert not (tmp_path / "plan.json").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (("--robots 4", "--robots 9"), "the scenario has 4 robots; --robots asks for 9"),
         (("--scen {scen}", "--scen {scen}.missing"), "floor.scen.missing"),
         (("--scen {scen}", ""), "a plan needs --scen FILE.scen"),
+        (("--robots 4", "--robots 4 --lifelong"), "leave out --scen"),
+        (
+            ("--scen {scen}", "--lifelong --planner lacam --seconds 0"),
+            "its own; leave out --seconds, --planner",
+        ),
         (("--robots 4", "--robots 4 --planner best"), "there is no planner 'best'; installed are"),
         (("\t5\t0\t0\t3", "\t0\t0\t0\t3"), "robots 0 and 1 have the same start, cell 0"),
         (("\t5\t0\t0\t3", "\t1\t1\t0\t3"), "line 3: (1, 1) is not a free cell of the map"),
