@@ -67,8 +67,8 @@ class Effort(NamedTuple):
 def driven(zone_cost: Mapping[str, float]) -> dict[str, float]:
     """Return of zones' costs those that change what a robot drives: it cannot enter the zone.
 
-    Other costs only choose robots and ways: a metre takes as much out of the battery as elsewhere. Detours that
-    robots make around such zones are not counted.
+    Other costs only choose robots and ways: a metre takes as much out of the battery as elsewhere. Detours
+    that robots make around such zones are not counted.
     """
     return {name: factor for name, factor in zone_cost.items() if factor == inf}
 

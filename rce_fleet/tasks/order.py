@@ -34,7 +34,7 @@ class Action(Enum):
     DELIVER = "deliver"
     """It gives a load away."""
     CHARGE = "charge"
-    """It charges until its battery is sufficient, or for the duration; without cells, at any charger."""
+    """It charges until its battery is full, or for the duration; without cells, at any charger."""
     PARK = "park"
     """It goes out of the way; without cells, to any parking place."""
 
