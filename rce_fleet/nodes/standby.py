@@ -7,11 +7,14 @@ same moment as another one, finds that the other has taken over its service: it 
 from __future__ import annotations
 
 import asyncio
+import time
+from enum import Enum, auto
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from rce.ros.errors import MasterError
 from rce.ros.node.master import MasterClient
+from rce.ros.tcpros.header import encode_header
 from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:
@@ -23,7 +26,20 @@ if TYPE_CHECKING:
 _LOOK_EVERY = 1.0
 """Seconds between two looks for another program."""
 _PROBE_S = 2.0
-"""Seconds in which a running program accepts a connection."""
+"""Seconds in which a running program answers."""
+HUNG_S = 30.0
+"""Seconds after which a program that accepts connections and does not answer is given up."""
+
+
+class _Presence(Enum):
+    """What is at the address of a service."""
+
+    GONE = auto()
+    """Nothing that accepts connections."""
+    HUNG = auto()
+    """The kernel accepts connections; the program does not answer."""
+    ANSWERS = auto()
+    """A program that answers, or closes the connection."""
 
 
 async def serve_in_turn(serve: Callable[[], Awaitable[int | None]]) -> int:
@@ -43,6 +59,8 @@ async def stand_by(node: Node, program: str, service: str) -> bool:
     """Wait while another program of its kind serves this ROS graph.
 
     The registration of a program that was killed stays at the master; so the service's address is tried too.
+    A program that has been stopped still accepts connections: after :data:`HUNG_S` without an answer this one
+    takes over, and the other one stands by when it runs again.
 
     Args:
         node: Running node, before it provides services.
@@ -52,13 +70,29 @@ async def stand_by(node: Node, program: str, service: str) -> bool:
     Returns:
         Whether to go on; False if the node was stopped meanwhile.
     """
-    is_told = False
+    is_told, hung_since = False, 0.0
     async with RpcClient() as rpc:
         master = MasterClient(node.master_uri, node.name, node.uri, rpc)
         while True:
             address = await _service_address(master, service)
-            if not address or not await _answers(address):
+            presence = await _look(address, service, node.name)
+            if presence is _Presence.GONE:
                 break
+            if presence is _Presence.ANSWERS:
+                hung_since = 0.0
+            elif not hung_since:
+                hung_since = time.monotonic()
+                node.log.error(
+                    "the other %s (%s at %s) accepts connections and does not answer: this one takes over"
+                    " in %.0f s if that stays so",
+                    *(program, service, address, HUNG_S),
+                )
+            elif time.monotonic() - hung_since >= HUNG_S:
+                node.log.warning(
+                    "the other %s has not answered for %.0f s: this one takes over; end the other one",
+                    *(program, HUNG_S),
+                )
+                return not node.is_shutdown
             if not is_told:
                 node.log.error(
                     "another %s serves this fleet (%s at %s): this one stands by until it ends",
@@ -94,15 +128,24 @@ async def _service_address(master: MasterClient, service: str) -> str:
         return ""
 
 
-async def _answers(address: str) -> bool:
-    """Return whether something accepts connections at an address such as ``rosrpc://host:port``."""
+async def _look(address: str, service: str, caller: str) -> _Presence:
+    """Return what is at an address such as ``rosrpc://host:port``; only the service's type is asked for."""
     place = urlsplit(address)
     if place.hostname is None or place.port is None:
-        return False
+        return _Presence.GONE
     try:
         async with asyncio.timeout(_PROBE_S):
-            _, writer = await asyncio.open_connection(place.hostname, place.port)
+            reader, writer = await asyncio.open_connection(place.hostname, place.port)
     except (OSError, TimeoutError):
-        return False
-    writer.close()
-    return True
+        return _Presence.GONE
+    try:
+        writer.write(encode_header({"callerid": caller, "service": service, "md5sum": "*", "probe": "1"}))
+        async with asyncio.timeout(_PROBE_S):
+            await reader.read(1)
+    except TimeoutError:
+        return _Presence.HUNG
+    except OSError:
+        pass  # It ended meanwhile, or refuses: the next look tells.
+    finally:
+        writer.close()
+    return _Presence.ANSWERS

@@ -175,6 +175,7 @@ async def test_a_planner_that_was_hung_leaves_the_fleet_to_its_successor() -> No
         first.send_signal(signal.SIGSTOP)
         stack.callback(first.send_signal, signal.SIGCONT)
         await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
+        await judge.hears("/spare: the other planner (/fleet/set_goal at ")
         await judge.hears("/spare: another planner serves this fleet")
         await judge.fill_backlog("/fleet/set_goal")
         await judge.hears("/spare: the other planner has ended: this one takes over")
@@ -183,6 +184,24 @@ async def test_a_planner_that_was_hung_leaves_the_fleet_to_its_successor() -> No
         await judge.hears(
             "/first: the planner /spare has taken over this fleet: this one stops, and stands by"
         )
+        await judge.hears("/first: another planner serves this fleet")
+        assert await judge.planner_began() == after
+
+
+async def test_a_hung_planner_is_given_up_after_a_while() -> None:
+    """Its kernel accepts connections, as long as it is stopped."""
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=first"))
+        before = await judge.planner_began()
+        first.send_signal(signal.SIGSTOP)
+        stack.callback(first.send_signal, signal.SIGCONT)
+        await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
+        await judge.hears("accepts connections and does not answer: this one takes over in 30 s")
+        await judge.hears("/spare: the other planner has not answered for 30 s: this one takes over")
+        after = await judge.planner_began()
+        assert after != before
+        first.send_signal(signal.SIGCONT)
         await judge.hears("/first: another planner serves this fleet")
         assert await judge.planner_began() == after
 
