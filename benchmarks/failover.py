@@ -1,4 +1,7 @@
-"""A robot task set ends: how long its robots take until they are at another one, with all that they had."""
+"""A robot task set ends or is drained: how long its robots take until they are at another one.
+
+They have all that they had there.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import aiohttp
 import psutil
 
 from benchmarks.engine import BIN, free_ports
@@ -22,7 +26,9 @@ from rce_client import Connection
 CONTAINER, STRING = "planner", "std_msgs/String"
 TARGET_S = 2.0
 WAIT_S = 120.0
-WAYS = {"killed (-9)": signal.SIGKILL, "stopped (SIGTERM)": signal.SIGTERM}
+DRAINED = "drained (rce drain)"
+WAYS = {"killed (-9)": signal.SIGKILL, "stopped (SIGTERM)": signal.SIGTERM, DRAINED: None}
+"""How a robot task set ends; None: it runs on, and takes no robots."""
 
 
 class _Parts:
@@ -70,13 +76,44 @@ class _Parts:
             await asyncio.gather(*self._readers)
 
 
+class _Api:
+    """The master's REST API, for an administrator."""
+
+    def __init__(self, session: aiohttp.ClientSession) -> None:
+        self._session = session
+
+    @classmethod
+    @contextlib.asynccontextmanager
+    async def of(cls, url: str) -> AsyncIterator[_Api]:
+        """Log in at a master."""
+        async with aiohttp.ClientSession(f"{url}api/v1/", raise_for_status=True) as session:
+            async with session.post("login", json={"userID": "testUser", "password": "testUser"}) as reply:
+                session.headers["Authorization"] = f"Bearer {(await reply.json())['token']}"
+            yield cls(session)
+
+    async def robot_task_set(self) -> str:
+        """Return the name of the only robot task set that is connected."""
+        while True:
+            async with self._session.get("machines") as reply:
+                machines = (await reply.json())["machines"]
+            found = [one["process"] for one in machines if one["kind"] == "robot" and one["connected"]]
+            if len(found) == 1:
+                return str(found[0])
+            await asyncio.sleep(0.1)  # the master has not noticed yet that a former one ended
+
+    async def drain(self, name: str) -> None:
+        """Give a task set no more robots, and send away those that it has."""
+        async with self._session.put(f"machines/{name}/drain"):
+            pass
+
+
 async def _read(child: Child) -> None:
     async for _ in child.lines():
         pass
 
 
 async def run(*, robots: int, passes: int) -> list[dict[str, Any]]:
-    """End the robot task set of all robots, beside another one that is empty; one row for each time."""
+    """End or drain the robot task set of all robots, beside one that is empty; one row for each time."""
     folder = Path(tempfile.mkdtemp(prefix="rce-bench-", dir="/tmp"))
     parts = _Parts(folder)
     rows = []
@@ -85,13 +122,18 @@ async def run(*, robots: int, passes: int) -> list[dict[str, Any]]:
             there = await parts.robots()
             fleet = [await _join(stack, parts.url, number) for number in range(robots)]
             await _all_active(fleet)
+            api = await stack.enter_async_context(_Api.of(parts.url))
             for way, number in WAYS.items():
                 for _ in range(passes):
+                    name = await api.robot_task_set()
                     other = await parts.robots()
                     processes = [psutil.Process(one.pid) for one in parts.children if one is not there]
                     del parts.children[parts.children.index(there)]
                     before, begin = _cpu(processes), perf_counter()
-                    os.kill(there.pid, number)
+                    if number is None:
+                        await api.drain(name)
+                    else:
+                        os.kill(there.pid, number)
                     await asyncio.gather(*(robot.lost.wait() for robot in fleet))
                     await _all_active(fleet)
                     seconds = perf_counter() - begin

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks import attacks
+from benchmarks import attacks, failover
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -275,6 +275,13 @@ TARGETS = [
         "a robot task set ends: its 200 robots are at another one, with all that they had",
         "failover",
         _greatest("seconds until all are elsewhere", robots=200),
+        2,
+        "s",
+    ),
+    Target(
+        "a robot task set is drained: the same",
+        "failover",
+        _greatest("seconds until all are elsewhere", **{"robot task set": failover.DRAINED, "robots": 200}),
         2,
         "s",
     ),
