@@ -114,6 +114,7 @@ async def topics_without_readers(engine: Engine) -> None:
                 (f"deaf{number}", "in", "PublisherForwarder", STRING),
             )
             deaf.transport.pause_reading()
+            stack.callback(deaf.transport.abort)  # else it waits for an answer to its close
         await until(lambda: _established(engine) == 5, what="the topics are connected")
         reading = asyncio.create_task(_read(source))
         payload = struct.pack("<I", 5 * MB) + b"x" * (5 * MB)
@@ -201,11 +202,12 @@ async def latched_topics(engine: Engine) -> None:
             await send(source, "DM", data)
             await source.send(id_.encode() + payload)
         await until(lambda: _held(engine) > 4 * 5 * MB, what="messages are kept")
+        for name in ("source", "keeper"):  # both ends keep them, while a robot is away, too
+            ends = [{"endpointTag": name, "interfaceTag": tag} for tag in tags]
+            await send(source, "CN", {"removeInterfaces": ends})
+        await until(lambda: not _established(engine), what="the topics are removed")
         for task in reading:
             task.cancel()
-        ends = [{"endpointTag": "keeper", "interfaceTag": tag} for tag in tags]
-        await send(keeper, "CN", {"removeInterfaces": ends})
-        await until(lambda: not _established(engine), what="the topics are removed")
 
 
 async def images(engine: Engine) -> None:
@@ -227,6 +229,8 @@ async def images(engine: Engine) -> None:
             await camera.send(id_.encode() + file.getvalue())
         await until(lambda: _held(engine) > 40 * MB, what="an image waits")
         reading.cancel()
+        for socket in (camera, deaf):
+            socket.transport.abort()
 
 
 async def _wait_for_end(reader: asyncio.StreamReader) -> None:
