@@ -10,11 +10,10 @@ import asyncio
 import contextlib
 import math
 import time
-from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.guard import CrowdedError, Rates, Turns
+from rce.guard import CrowdedError, NoPlaceError, Places, Rates, Turns
 from rce_master.exceptions import TooMuchError
 from rce_master.state.user_records import User, UserRole
 
@@ -66,7 +65,7 @@ class Quotas:
         burst = self._settings.request_burst
         self._rest, self._robots = (self._rates(burst) for _ in range(2))
         self._replays = self._rates(min(burst, REPLAY_BURST))
-        self._streams: Counter[str] = Counter()
+        self._streams = Places(each=self._settings.streams)
         self._reads = Turns(READS_AT_ONCE, waiting=READS_WAITING, each=self._settings.log_reads)
         self._lists = Turns(LISTS_AT_ONCE, waiting=LISTS_WAITING, each=1)
 
@@ -105,18 +104,19 @@ class Quotas:
         Raises:
             TooMuchError: There are too many streams.
         """
-        most = self._settings.streams
-        if most and user.role is not UserRole.ADMIN and self._streams[user.name] >= most:
-            raise TooMuchError(
-                f"you follow {most} streams of events or usage already, and may not follow more; end one", 1
-            )
-        self._streams[user.name] += 1
-        try:
+        if user.role is UserRole.ADMIN:
             yield
-        finally:
-            self._streams[user.name] -= 1
-            if not self._streams[user.name]:
-                del self._streams[user.name]
+            return
+        with contextlib.ExitStack() as place:
+            try:
+                place.enter_context(self._streams.place(user.name))
+            except NoPlaceError as error:
+                raise TooMuchError(
+                    f"you follow {error.most} streams of events or usage already, and may not follow more;"
+                    " end one",
+                    1,
+                ) from None
+            yield
 
     @contextlib.asynccontextmanager
     async def log_read(self, user: User) -> AsyncIterator[None]:

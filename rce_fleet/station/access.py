@@ -13,6 +13,7 @@ from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
 from rce.web.routes import Route, parameter_fault
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, Authenticator, StationUser
+from rce_fleet.station.quotas import StationQuotas
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -34,9 +35,16 @@ class AccessControl:
     Args:
         authenticator: Finds the user of a token.
         names: Host names under which the station may be requested.
+        quotas: What one user may ask for.
+
+    Attributes:
+        quotas: The same.
     """
 
-    def __init__(self, authenticator: Authenticator, names: ServerNames) -> None:
+    def __init__(
+        self, authenticator: Authenticator, names: ServerNames, quotas: StationQuotas | None = None
+    ) -> None:
+        self.quotas = quotas or StationQuotas()
         self._authenticator = authenticator
         self._names = names
         self.on_audit: Callable[[str, AuditedAction], None] | None = None
@@ -56,8 +64,8 @@ class AccessControl:
         user, is_left_over = await self._find_user(request, token)
         if user is None:
             return self._unauthorized(request, token)
-        if not user.may_view:
-            return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
+        if (answer := self._refuse(request, user)) is not None:
+            return answer
         request[USER], request[TOKEN] = user, "" if is_left_over else token
         response = await handler(request)
         if is_left_over and not response.prepared:
@@ -104,6 +112,16 @@ class AccessControl:
         if self.on_audit is not None:
             self.on_audit(request[USER].name, action)
 
+    def _refuse(self, request: web.Request, user: StationUser) -> web.Response | None:
+        """Return why a user may not make a request, whatever it asks for; None if they may."""
+        if not user.may_view:
+            return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
+        seconds = 0 if _is_stop(request) else self.quotas.request(user)
+        if not seconds:
+            return None
+        text = f"too many requests; try again in {seconds} s"
+        return problem(429, text, {hdrs.RETRY_AFTER: str(seconds)})
+
     async def _find_user(self, request: web.Request, token: str) -> tuple[StationUser | None, bool]:
         """Return the user, and whether the token is a cookie that is not valid at a station without logins.
 
@@ -113,7 +131,7 @@ class AccessControl:
             AuthenticationError: The token cannot be checked now.
         """
         request[IS_CHECKED] = True
-        if request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP):
+        if _is_stop(request):
             user = await self._user_of_stop(request, token)
         else:
             user = await self._authenticator.authenticate(token)
@@ -149,6 +167,11 @@ class AccessControl:
         if token:
             text = f"the token is not valid here (it may have ended, or be of another engine): {text}"
         return problem(401, text, {hdrs.WWW_AUTHENTICATE: "Bearer"})
+
+
+def _is_stop(request: web.Request) -> bool:
+    """Return whether a request stops robots, or releases them."""
+    return request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP)
 
 
 def with_known_query(route: Route[Any], handler: Handler) -> Handler:

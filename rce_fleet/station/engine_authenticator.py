@@ -6,9 +6,9 @@ import asyncio
 import logging
 import ssl
 import time
-from collections import OrderedDict
 from dataclasses import dataclass
 from http import HTTPStatus
+from math import inf
 from typing import TYPE_CHECKING, Any, Self, TypedDict, TypeVar
 
 import aiohttp
@@ -21,6 +21,7 @@ from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_fleet.station.action_queue import ActionQueue, ActionRefusedError, EngineAwayError, QueuedAction
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, StationUser
+from rce_fleet.station.token_cache import TokenCache
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -35,7 +36,6 @@ OFFLINE_CACHE_S = 30.0
 """How long it is used while the master cannot be reached."""
 LIFETIME_S = 12 * 3600.0
 """Lifetime of a login at the page."""
-MAX_CACHED = 1000
 _PASSED_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
 """Status of the master's answer to a login -> status of the station's; all others become 503."""
 T = TypeVar("T")
@@ -89,7 +89,7 @@ class EngineAuthenticator:
         self._account = account
         self._masters = Masters(account.url)
         self._allow_anonymous = allow_anonymous
-        self._cache: OrderedDict[str, tuple[float, StationUser | None]] = OrderedDict()
+        self._cache = TokenCache()
         self._actions = ActionQueue(self._send_action)
         self._own_token = ""
         self._session: aiohttp.ClientSession
@@ -134,28 +134,24 @@ class EngineAuthenticator:
                 StationUser(self._account.user, "operator", is_owner=True) if self._allow_anonymous else None
             )
         now = time.monotonic()
-        asked_at, known = self._cache.get(token, (0.0, None))
-        if token in self._cache and now - asked_at < CACHE_S:
+        known = self._cache.known(token, now - CACHE_S)
+        if known is not None or self._cache.is_refused(token, now - CACHE_S):
             return known
         try:
             user = await self._in_turn(lambda: self._ask(token), reads=True)
         except _REQUEST_ERRORS as error:
-            if token in self._cache and known is not None and now - asked_at < OFFLINE_CACHE_S:
+            if (known := self._cache.known(token, now - OFFLINE_CACHE_S)) is not None:
                 return known
             raise AuthenticationError(
                 503,
                 f"the engine cannot be reached to check the login; try again ({_reason_of(error)})",
             ) from error
-        self._cache[token] = (now, user)
-        self._cache.move_to_end(token)
-        if len(self._cache) > MAX_CACHED:
-            self._cache.popitem(last=False)
+        self._cache.put(token, user, now)
         return user
 
     def last_known(self, token: str) -> StationUser | None:
         """Return the user of a token as it was last checked; None if it was not, or was not valid then."""
-        asked_at, known = self._cache.get(token, (0.0, None))
-        return known if time.monotonic() - asked_at < LIFETIME_S else None
+        return self._cache.known(token, time.monotonic() - LIFETIME_S)
 
     async def log_in(self, user: str, password: str, address: str) -> str:
         """Return a token for a user.
@@ -183,7 +179,7 @@ class EngineAuthenticator:
 
     async def log_out(self, token: str) -> None:
         """Revoke a token."""
-        self._cache.pop(token, None)
+        self._cache.forget(token)
         try:
             async with self._session.delete(
                 self._api / "login", headers=_bearer(token), **self._account.options
@@ -194,7 +190,7 @@ class EngineAuthenticator:
 
     def audit(self, token: str, action: AuditedAction) -> None:
         """Queue an action for the engine's audit log. Does not wait."""
-        _, known = self._cache.get(token, (0.0, None))
+        known = self._cache.known(token, -inf)
         self._actions.put(QueuedAction(token, "" if known is None else known.name, action))
 
     async def _in_turn(self, request: Callable[[], Awaitable[T]], *, reads: bool = False) -> T:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import csv
 import io
 import json
@@ -13,19 +14,21 @@ from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
 
+from rce.guard import NoPlaceError
 from rce.web.writing import write
 from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station.access import USER, problem
 from rce_fleet.station.events import EventCursor, EventFeed
 from rce_fleet.station.planner_client import PlannerUnavailableError
+from rce_fleet.station.quotas import why_no_place
 
 if TYPE_CHECKING:
+    from yarl import URL
+
     from rce_fleet.station.access import AccessControl
     from rce_fleet.station.fleet_requests import FleetRequests
 
 EVENT_STREAM, CSV = "text/event-stream", "text/csv"
-MAX_STREAMS = 100
-"""Open streams of events at one station."""
 AWAY_S = 2.0
 MAX_ROWS = 1_000_000
 _PAGE = 1000
@@ -52,7 +55,6 @@ class EventStreams:
         self._requests = requests
         self._feed = feed
         self._access = access
-        self._open = 0
 
     async def events(self, request: web.Request) -> web.StreamResponse:
         """Return events after a number; with ``Accept: text/event-stream``, follow them."""
@@ -67,15 +69,19 @@ class EventStreams:
         if last and found is None:
             return problem(422, f"Last-Event-ID must be the id or number of an event, not {last[:40]!r}")
         journal, number = (found[1] or "", int(found[2])) if found else ("", None)
-        if self._open >= MAX_STREAMS:
-            return problem(
-                429, f"{MAX_STREAMS} streams of events are open; close some", {"Retry-After": "10"}
-            )
-        self._open += 1
-        try:
-            return await self._follow(request, EventCursor(self._feed, number, journal))
-        finally:
-            self._open -= 1
+        cursor = EventCursor(self._feed, number, journal)
+        return await self._in_place(request, lambda: self._follow(request, cursor))
+
+    async def _in_place(
+        self, request: web.Request, answer: Callable[[], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Answer while the user has a place for a stream, or refuse."""
+        with contextlib.ExitStack() as place:
+            try:
+                place.enter_context(self._access.quotas.streams.place(request[USER].name))
+            except NoPlaceError as error:
+                return problem(429, why_no_place("streams of events", error), {"Retry-After": "10"})
+            return await answer()
 
     async def _follow(self, request: web.Request, cursor: EventCursor) -> web.StreamResponse:
         headers = {hdrs.CONTENT_TYPE: EVENT_STREAM, hdrs.CACHE_CONTROL: "no-store", "X-Accel-Buffering": "no"}
@@ -105,7 +111,9 @@ class EventStreams:
         first = url.query.get("after", "0")
         if not (first.isdecimal() and len(first) <= _DIGITS):
             return problem(422, f"after must be the number of an event, not {first[:40]!r}")
-        after = int(first)
+        return await self._in_place(request, lambda: self._history_csv(request, url, int(first)))
+
+    async def _history_csv(self, request: web.Request, url: URL, after: int) -> web.StreamResponse:
         response: web.StreamResponse | None = None
         for _ in range(MAX_ROWS // _PAGE):
             asked = url.update_query({"after": str(after), "limit": str(_PAGE)})

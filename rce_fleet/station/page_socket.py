@@ -11,8 +11,11 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import ValidationError
 
 from rce.aio.tasks import cancel_and_wait
+from rce.guard import NoPlaceError
 from rce.web.closing import close_socket
+from rce_fleet.station.access import USER, problem
 from rce_fleet.station.api import LayersRequest
+from rce_fleet.station.quotas import why_no_place
 
 if TYPE_CHECKING:
     from rce_fleet.station.access import AccessControl
@@ -47,6 +50,14 @@ class PageSocket:
         Without ``?changes=1`` it gets everything whenever something changes, as pages of 0.1 expect. With
         ``frames=1`` it gets poses in binary frames.
         """
+        with contextlib.ExitStack() as place:
+            try:
+                place.enter_context(self._access.quotas.pages.place(request[USER].name))
+            except NoPlaceError as error:
+                return problem(429, why_no_place("pages", error), {"Retry-After": "10"})
+            return await self._serve(request)
+
+    async def _serve(self, request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False, max_msg_size=MAX_MESSAGE)
         await socket.prepare(request)
         page = self._pages.open(

@@ -156,7 +156,7 @@ class Station:
         routes = (route for table, _ in tables for route in table)
         operations = [*(route.operation for route in routes), *self.fleet_api.operations]
         document = build_document(
-            [replace(each, errors=tuple({*each.errors, 422})) for each in operations],
+            [replace(each, errors=tuple({*each.errors, 422, 429})) for each in operations],
             title="RCE operator station",
             description="Control a fleet of robots: tasks, goals, zones, events. For the page and an ERP.",
             error=Problem,

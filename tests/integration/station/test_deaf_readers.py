@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 from aiohttp import ClientSession, web
 from aiohttp.test_utils import TestServer
+from support.station_access import OpenAccess, name_user
 
 from rce.web import writing
 from rce_fleet.station import event_streams
@@ -15,14 +16,6 @@ from rce_fleet.station.event_streams import EventStreams
 from rce_fleet.station.events import EventBatch, EventFeed
 
 LARGE = "x" * 20_000
-
-
-class Access:
-    """Lets all of them in."""
-
-    async def is_still_allowed(self, request: web.Request) -> bool:
-        del request
-        return True
 
 
 async def ask(after: int, limit: int) -> EventBatch:
@@ -33,10 +26,9 @@ async def ask(after: int, limit: int) -> EventBatch:
 
 async def test_a_stream_whose_client_takes_nothing_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of a program that hangs, or of a console that was stopped by Ctrl-Z."""
-    monkeypatch.setattr(event_streams, "MAX_STREAMS", 1)
     monkeypatch.setattr(writing, "WRITE_S", 0.5)
-    streams = EventStreams(cast("Any", None), EventFeed(ask), cast("Any", Access()))
-    app = web.Application()
+    streams = EventStreams(cast("Any", None), EventFeed(ask), cast("Any", OpenAccess(streams=1)))
+    app = web.Application(middlewares=[name_user])
     app.router.add_get("/events", streams.events)
     headers = {"Accept": event_streams.EVENT_STREAM}
     async with TestServer(app) as server, ClientSession() as session, asyncio.timeout(60):

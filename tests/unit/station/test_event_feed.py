@@ -9,6 +9,7 @@ from typing import Any, cast
 import pytest
 from aiohttp import ClientSession, web
 from aiohttp.test_utils import TestServer
+from support.station_access import OpenAccess, name_user
 
 from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station import events as module
@@ -80,8 +81,8 @@ async def test_a_stream_begins_with_the_id_of_the_newest_event() -> None:
     journal = Journal(5)
     feed = EventFeed(journal.ask)
     tell(feed, journal, 4, 5)
-    app = web.Application()
-    streams = EventStreams(cast("Any", None), feed, cast("Any", None))
+    app = web.Application(middlewares=[name_user])
+    streams = EventStreams(cast("Any", None), feed, cast("Any", OpenAccess()))
     app.router.add_get("/events", streams.events)
     async with TestServer(app) as server, ClientSession() as session:
         asked = session.get(server.make_url("/events"), headers={"Accept": "text/event-stream"})
@@ -189,8 +190,8 @@ async def test_a_stream_tells_its_gap_and_resumes_after_it() -> None:
     """Without the gap, a program that was away took the events after it for all."""
     journal = ShortJournal(50)
     feed = EventFeed(journal.ask)
-    streams = EventStreams(cast("Any", None), feed, cast("Any", Always()))
-    app = web.Application()
+    streams = EventStreams(cast("Any", None), feed, cast("Any", OpenAccess()))
+    app = web.Application(middlewares=[name_user])
     app.router.add_get("/events", streams.events)
     async with TestServer(app) as server, ClientSession() as session, asyncio.timeout(60):
 
@@ -209,10 +210,3 @@ async def test_a_stream_tells_its_gap_and_resumes_after_it() -> None:
         assert after.startswith("id: aa:41\n")
         resumed, _ = await follow(fields["id"])
         assert resumed.startswith("id: aa:41\n")
-
-
-class Always:
-    """Lets each user in."""
-
-    async def is_still_allowed(self, _request: web.Request) -> bool:
-        return True
