@@ -169,6 +169,13 @@ class CellChange(ApiModel):
     blocked: bool
 
 
+class FleetModeChange(ApiModel):
+    """Whether the fleet drives."""
+
+    mode: Literal["automatic", "paused"] = Field(description="paused: robots get no new cells and stand.")
+    reason: str = Field(default="", max_length=MOST_REASON)
+
+
 class GoalChange(ApiModel):
     """The goal of a robot."""
 

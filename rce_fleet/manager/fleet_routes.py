@@ -8,6 +8,7 @@ from rce_fleet.api.fleet import (
     EventModel,
     EventPage,
     FleetMapModel,
+    FleetModeChange,
     FleetRobotModel,
     GoalAnswer,
     GoalChange,
@@ -86,6 +87,17 @@ async def take_out(call: Call) -> FleetAnswer:
 async def put_in(call: Call) -> FleetAnswer:
     """Put a robot into service again."""
     return await _set_mode(call, AUTOMATIC, "put in")
+
+
+async def set_fleet_mode(call: Call) -> FleetAnswer:
+    """Pause the fleet, or let it drive; if the planner refuses, it stays as it was."""
+    model, manager = call.model(FleetModeChange), call.manager
+    refusal = await manager.set_fleet_mode(model.mode, model.reason, call.request.user)
+    if refusal.startswith(NO_ANSWER):
+        return problem(503, refusal)
+    if refusal:
+        raise TaskRefusedError(refusal)
+    return shown(GoalAnswer(message=f"the fleet is {model.mode}"))
 
 
 async def set_goal(call: Call) -> FleetAnswer:
@@ -246,6 +258,7 @@ ROUTES = [
     Route("POST", "/robots/{id}/take-out", take_out, changes=True),
     Route("POST", "/robots/{id}/put-in", put_in, changes=True),
     Route("PUT", "/robots/{id}/goal", set_goal, changes=True),
+    Route("PUT", "/mode", set_fleet_mode, changes=True),
     Route("GET", "/map", fleet_map),
     Route("GET", "/statistics", statistics),
     Route("GET", "/events", events),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, assert_never
 
@@ -16,12 +17,13 @@ from rce_fleet.journal.journal import EventQuery, event_fields
 from rce_fleet.manager.clock import WallClock
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.hand_goals import HandGoals
-from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.planner_sync import FLEET, BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.clamping import clamped
 from rce_fleet.tasks.dispatch import Dispatcher, TaskRules
 from rce_fleet.tasks.facts import FleetFacts
+from rce_fleet.tasks.records import FleetEntry
 from rce_fleet.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -235,6 +237,38 @@ class FleetManager:
         self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
         refusal = await self._call(call)
         self._sync.took(call, self.clock(), refused=bool(refusal))
+        return refusal
+
+    async def set_fleet_mode(self, mode: str, reason: str, user: str) -> str:
+        """Keep the fleet's mode in the journal, then send it to the planner at once.
+
+        Args:
+            mode: ``automatic`` or ``paused``.
+            reason: Why, for people.
+            user: Who asks.
+
+        Returns:
+            Why the planner refused, so that the mode is as it was before; empty: it did not, or gets the mode
+            when it is heard again.
+
+        Raises:
+            JournalError: The journal cannot be written.
+        """
+        book, before = self.book, self.book.fleet
+        changed = FleetEntry(mode, reason, user, before.revision + 1, unsent=True)
+        text = f"the fleet is {mode}" + (f": {reason}" if reason else "")
+        book.emit(changed, mode, self.clock(), user=user, text=text)
+        await self.commit()
+        if not self.facts.is_live:
+            return ""
+        call = SetMode(FLEET, mode, reason, user)
+        self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
+        refusal = await self._call(call)
+        self._sync.took(call, self.clock(), refused=bool(refusal))
+        if refusal and self.book.fleet == changed:
+            back = replace(before, revision=changed.revision + 1)
+            self.book.emit(back, "refused", self.clock(), text=f"the fleet stays {before.mode}: {refusal}")
+            await self.commit()
         return refusal
 
     async def set_goal(self, robot: str, cell: int | None, user: str) -> str:

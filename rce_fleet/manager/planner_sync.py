@@ -162,15 +162,17 @@ class PlannerSync:
         else:
             self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
 
-    def confirmed(self) -> list[RobotEntry | Zone | BlockedCells]:
+    def confirmed(self) -> list[RobotEntry | FleetEntry | Zone | BlockedCells]:
         """Return records whose change by a request the planner has now, marked so."""
         if not self._is_comparable():
             return []
         book, modes, zones = self._book, self._modes_kept(), self._zones_kept()
         entries = [entry for entry in book.robots.values() if entry.unsent]
         changed = [zone for zone in (*book.zones.values(), *book.removed_zones.values()) if zone.unsent]
+        fleet = [book.fleet] if book.fleet.unsent and self._modes.is_known(FLEET, modes.get(FLEET)) else []
         return [
             *self._confirmed_cells(),
+            *(replace(each, unsent=False) for each in fleet),
             *(
                 replace(each, unsent=False)
                 for each in entries
@@ -227,8 +229,10 @@ class PlannerSync:
         return kept, {name: mode for name, mode in seen.items() if mode != AUTOMATIC}
 
     def _unsent_modes(self) -> dict[str, str]:
-        """Return stand-ins that no mode equals, for robots whose mode the planner may not have."""
-        return {name: "" for name, entry in self._book.robots.items() if entry.unsent}
+        """Return stand-ins that no mode equals, for robots or a fleet whose mode the planner may not have."""
+        book = self._book
+        robots = {name: "" for name, entry in book.robots.items() if entry.unsent}
+        return {**robots, FLEET: ""} if book.fleet.unsent else robots
 
     def _unsent_zones(self) -> dict[str, Zone]:
         """Return stand-ins that no zone equals, for zones that the planner may not have, or still has."""

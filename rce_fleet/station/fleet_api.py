@@ -164,6 +164,22 @@ class FleetApi:
         self._fleet.forget_cell(cell)
         return said
 
+    async def set_mode(self, mode: str, *, reason: str, user: StationUser) -> str:
+        """Pause the fleet, or let it drive; return the answer for people.
+
+        It is kept as a goal is.
+
+        Args:
+            mode: ``automatic`` or ``paused``.
+            reason: Why, for people.
+            user: Who asks.
+
+        Raises:
+            PlannerError: It was refused, or neither of them answers.
+        """
+        said = await self._by_manager("/mode", {"mode": mode, "reason": reason}, user)
+        return said or await self._fleet.set_mode("", mode, reason=reason, user=user.name)
+
     async def _by_manager(self, path: str, body: dict[str, object], user: StationUser) -> str | None:
         """Send a request to the fleet manager; None: there is none, or it does not run.
 

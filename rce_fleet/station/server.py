@@ -129,11 +129,11 @@ class Station:
         self._replay = ReplayRoutes(records)
         self._world = world_link.WorldRoutes(world, self._access)
         self._masters = masters_watch.MastersRoutes(kill_leader, self._access)
-        self._control = control_routes.ControlRoutes(
-            control, fleet, modes or ManualModes(fleet, view), self._access
-        )
         has_roles = self._authenticator.has_logins
         self.fleet_api = FleetApi(fleet, self._access, webhooks, has_roles=has_roles)
+        self._control = control_routes.ControlRoutes(
+            control, self.fleet_api, modes or ManualModes(fleet, view), self._access
+        )
         self.fleet_api.feed.on_restart = self._tell_restart
         self.fleet_api.manager.on_change = self._tell_manager
 

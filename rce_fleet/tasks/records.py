@@ -102,12 +102,14 @@ class FleetEntry:
         reason: Why, for people.
         user: Who decided it.
         revision: Grows with each change.
+        unsent: A request changed the mode, and the planner has not confirmed it yet.
     """
 
     mode: str = AUTOMATIC
     reason: str = ""
     user: str = ""
     revision: int = 0
+    unsent: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rce_fleet.station.commands.control import RobotControl
     from rce_fleet.station.commands.manual_mode import ManualModes
     from rce_fleet.station.commands.sources import CommandSender
-    from rce_fleet.station.fleet_link import FleetLink
+    from rce_fleet.station.fleet_api import FleetApi
 
 MAX_FRAME = 1 << 12
 CHECK_S = 2.0
@@ -86,7 +86,7 @@ class ControlRoutes:
     """
 
     def __init__(
-        self, control: RobotControl | None, fleet: FleetLink, modes: ManualModes, access: AccessControl
+        self, control: RobotControl | None, fleet: FleetApi, modes: ManualModes, access: AccessControl
     ) -> None:
         self._control = control
         self._fleet = fleet
@@ -180,7 +180,7 @@ class ControlRoutes:
         if refusal is not None:
             return refusal
         asked = ModeRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.set_mode("", asked.mode, reason=asked.reason, user=request[USER].name)
+        message = await self._fleet.set_mode(asked.mode, reason=asked.reason, user=request[USER])
         self._access.audit(request, "set_mode", "fleet", asked.mode)
         return _reply(Answer(message=message))
 

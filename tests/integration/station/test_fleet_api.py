@@ -25,6 +25,7 @@ from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, WebhookRequest, verify
 from rce_fleet.client import ApiError, EventsRestartedError, FleetClient, NotFoundError, OutdatedError
 from rce_fleet.station.authentication import StationUser
 
+KEPT = ("cells", "fleet", "goal")
 GO = {"stops": [{"cell": 9}]}
 
 
@@ -95,19 +96,21 @@ def session_of(url: str, token: str = "operator") -> aiohttp.ClientSession:
 
 
 async def check_that_the_manager_keeps_requests(erp: aiohttp.ClientSession) -> None:
-    """Block a cell, free it, and send a robot; each becomes an event of the manager with the user.
+    """Block and free a cell, pause and resume the fleet, send a robot: events of the manager with the user.
 
     They are the first requests to this station, which does not know yet whether there is a manager.
     """
     for blocked in (True, False):
         status, said, _ = await ask(erp, "PUT", "/cells/30", {"blocked": blocked})
         assert (status, "cell 30" in said["message"]) == (200, True)
+    for mode in ("paused", "automatic"):
+        assert (await ask(erp, "PUT", "/mode", {"mode": mode}))[0] == 200
     assert (await ask(erp, "PUT", "/robots/Robot1/goal", {"cell": 8}))[0] == 200
     status, said, _ = await ask(erp, "PUT", "/robots/Robot9/goal", {"cell": 8})
     assert (status, "Robot9" in said["error"]) == (409, True)
     events = (await ask(erp, "GET", "/events?limit=5000"))[1]["events"]
-    told = [(one["name"], one["user"]) for one in events if one["kind"] in ("cells", "goal") and one["user"]]
-    assert told == [(name, "the_operator") for name in ("blocked", "freed", "goal")]
+    told = [(one["name"], one["user"]) for one in events if one["kind"] in KEPT and one["user"]]
+    assert told == [(name, "the_operator") for name in ("blocked", "freed", "paused", "automatic", "goal")]
     assert (await ask(erp, "PUT", "/robots/Robot1/goal", {"cell": None}))[0] == 200
 
 

@@ -11,7 +11,7 @@ from support.fleet_manager import GO, ManagerClient
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.mirror import REFUSED_S
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
-from rce_fleet.tasks.records import BlockedCells, PlannerRun, Zone
+from rce_fleet.tasks.records import BlockedCells, FleetEntry, PlannerRun, Zone
 
 
 async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) -> None:
@@ -47,7 +47,7 @@ async def test_former_words_of_zones_are_understood(client: ManagerClient) -> No
 
 
 async def test_zones_reach_the_planner(client: ManagerClient) -> None:
-    """Also when it was away; a zone that only costs does not."""
+    """Also when it was away."""
     manager, planner = client.manager, client.planner
     manager.facts.is_current = True
     manager.planner_began(PlannerRun("1", "8 x 8"))
@@ -61,8 +61,8 @@ async def test_zones_reach_the_planner(client: ManagerClient) -> None:
     assert planner.calls == [], "it was sent again at once"
     manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
     await manager.step()
-    assert planner.calls == [("zone", "aisle", "slow")]
-    manager.facts.zones["aisle"] = manager.book.zones["aisle"]
+    assert planner.calls == [("zone", "aisle", "slow"), ("zone", "dear", "cost")]
+    manager.facts.zones |= manager.book.zones
     manager.clock._now += 1000.0  # type: ignore[attr-defined]
     await manager.step()
     assert planner.calls[-1] == ("zone", "aisle", None)
@@ -76,8 +76,7 @@ async def test_a_removed_zone_leaves_the_journal(client: ManagerClient, zone: di
     manager.facts.is_current = True
     manager.planner_began(PlannerRun("1", "8 x 8"))
     await client.ask("PUT", "/zones/z", {**zone, "cells": [3]})
-    if zone["kind"] == "blocked":
-        manager.facts.zones["z"] = manager.book.zones["z"]
+    manager.facts.zones["z"] = manager.book.zones["z"]
     await manager.step()
     assert [record for record in client.journal.load()[0] if isinstance(record, Zone)]
     planner.refusal = "the planner does not answer"
@@ -178,6 +177,59 @@ async def test_a_blocked_cell_is_in_the_journal_first(client: ManagerClient) -> 
     assert (await client.ask("PUT", "/cells/20", {"blocked": False}))[0] == 200
     assert planner.calls == [("cell", 12, True), ("cell", 20, False)]
     assert (await client.ask("PUT", "/cells/12", {"blocked": True}, role="viewer"))[0] == 403
+
+
+async def test_a_pause_of_the_fleet_survives_a_kill(tmp_path: Path) -> None:
+    """The manager is killed after its answer, before the planner has the pause; both run again."""
+
+    def begin() -> ManagerClient:
+        made = ManagerClient(tmp_path / "j.sqlite")
+        made.manager.facts.is_current = True
+        made.manager.planner_began(PlannerRun("1", "8 x 8"))
+        return made
+
+    first = begin()
+    await first.manager.step()
+    first.manager.facts.is_live = False
+    status, said, _ = await first.ask("PUT", "/mode", {"mode": "paused", "reason": "lunch"})
+    assert (status, said) == (200, {"message": "the fleet is paused"})
+    await first.manager.close()
+    second = begin()
+    await second.manager.step()
+    assert second.planner.calls == [("mode", "", "paused", "lunch", "erp")]
+    await second.manager.step()
+    await second.manager.close()
+    third = begin()
+    await third.manager.step()
+    assert third.planner.calls == [], "the planner has had it: now it was changed there"
+    assert third.manager.book.fleet.mode == "automatic"
+    await third.manager.close()
+
+
+async def test_a_pause_of_the_fleet_is_in_the_journal_first(client: ManagerClient) -> None:
+    kept: list[FleetEntry] = []
+    planner, told = client.planner, client.planner.set_mode
+
+    async def set_mode(robot: str, mode: str, reason: str, user: str) -> str:
+        records, _ = client.journal.load()
+        kept.extend(record for record in records if isinstance(record, FleetEntry))
+        return await told(robot, mode, reason, user)
+
+    planner.set_mode = set_mode  # type: ignore[method-assign]  # looks into the journal first
+    assert (await client.ask("PUT", "/mode", {"mode": "paused"}))[0] == 200
+    assert kept == [FleetEntry("paused", "", "erp", 1, unsent=True)]
+    assert planner.calls == [("mode", "", "paused", "", "erp")]
+    event = (await client.ask("GET", "/events"))[1]["events"][-1]
+    assert (event["name"], event["user"], event["text"]) == ("paused", "erp", "the fleet is paused")
+    assert (await client.ask("PUT", "/mode", {"mode": "stopped"}))[0] == 422
+    assert (await client.ask("PUT", "/mode", {"mode": "paused"}, role="viewer"))[0] == 403
+
+
+async def test_a_refused_pause_leaves_the_fleet_driving(client: ManagerClient) -> None:
+    for refusal, expected in (("no", 409), ("the planner does not answer: gone", 503)):
+        client.planner.refusal = refusal
+        status, said, _ = await client.ask("PUT", "/mode", {"mode": "paused"})
+        assert (status, said, client.manager.book.fleet.mode) == (expected, {"error": refusal}, "automatic")
 
 
 async def test_a_cell_that_the_planner_refuses_stays(client: ManagerClient) -> None:
