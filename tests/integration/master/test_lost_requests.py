@@ -281,7 +281,7 @@ async def test_a_slow_master_is_asked_again_with_more_time(monkeypatch: pytest.M
 @pytest.mark.usefixtures("impatient")
 async def test_what_a_silent_master_may_have_done_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     """It answered before, and hangs now: what was sent is not sent to another master."""
-    monkeypatch.setattr("rce_master.cli.client.REQUEST_S", 0.5)
+    monkeypatch.setattr("rce_master.cli.client.REQUEST_S", 2.0)
     master = Answering()
     async with (
         silent_master() as (silent, asked),

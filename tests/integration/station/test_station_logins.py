@@ -20,7 +20,7 @@ async def test_a_master_that_answers_nothing_is_passed_over(
     fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its program hangs, or its machine is off: another one tells who the user is."""
-    short = aiohttp.ClientTimeout(total=600, sock_connect=1, sock_read=1)
+    short = aiohttp.ClientTimeout(total=600, sock_connect=1, sock_read=2)
     monkeypatch.setattr("rce_fleet.station.engine_authenticator._TIMEOUT_OF_SEVERAL", short)
     logins = 0
 
