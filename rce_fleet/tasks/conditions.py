@@ -40,9 +40,11 @@ class Conditions:
         self.ready = []
         for task in list(self._book.open_tasks()):
             task = self._check_deadline(task, now)  # noqa: PLW2901 - the same task, changed
-            if task.state in NOT_BEGUN and task.next_stop is None:
+            if task.state is not TaskState.QUEUED and task.state is not TaskState.ASSIGNED:
+                continue
+            if task.position >= task.order.length:
                 self._finish(task, now)
-            elif task.state in NOT_BEGUN and self._can_begin(task, now):
+            elif self._can_begin(task, now):
                 self.ready.append(self._book.tasks[task.number])
         return self.ready
 
@@ -56,7 +58,7 @@ class Conditions:
         """Create occurrences that are due. One begins only after the one before has ended."""
         due = [
             task
-            for task in self._book.tasks.values()
+            for task in self._book.recurring_tasks()
             if task.recurs_at is not None and task.has_ended and task.recurs_at <= now
         ]
         for task in due:

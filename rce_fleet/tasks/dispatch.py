@@ -108,16 +108,15 @@ class Dispatcher:
         travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
         if travel.epoch != self._measured_epoch:
             self._measured_epoch, self._measured = travel.epoch, set()
-        open_tasks = list(book.open_tasks())
-        self._measured.intersection_update([task.number for task in open_tasks])
-        tasks = [task for task in open_tasks if task.number not in self._measured]
+        self._measured &= book.open_numbers()
+        tasks = [book.tasks[number] for number in book.open_numbers() - self._measured]
         if not tasks:
             return False
         self._profiles = zone_profiles(book, facts, self.rules.profile)
         costs = [self.profile(name).zone_cost for name in facts.robots]
         each_once = {id(cost): cost for cost in costs}.values()
         zone_costs = {str(cost): cost for each in each_once for cost in (each, driven(each))}
-        stops = self._stops(open_tasks) if len(zone_costs) > 1 else ()
+        stops = book.used_cells() if len(zone_costs) > 1 else ()
         if len(zone_costs) > MOST_GRAPHS or len(zone_costs) * len(stops) > travel.capacity:
             zone_costs = {"": {}}  # The distances of each robot's own zones follow in the steps.
         missing: dict[str, set[int]] = {name: set() for name in zone_costs}
@@ -136,10 +135,6 @@ class Dispatcher:
         for name, cost in zone_costs.items():
             travel.measure(sorted(missing[name]), cost)
         return bool(tasks) and len(self._measured) < travel.capacity
-
-    @staticmethod
-    def _stops(tasks: Iterable[Task]) -> set[int]:
-        return {cell for task in tasks for cell in task.order.cells()}
 
     def update(self, now: float, facts: FleetFacts) -> None:
         """Take one step.
@@ -182,7 +177,7 @@ class Dispatcher:
             self._queues_due = now + QUEUES_EVERY
             self._fill_queues(now, facts)
             self._explain(facts, now)
-        used = {*book.places.chargers}.union(self._stops(book.open_tasks()))
+        used = {*book.places.chargers}.union(book.used_cells())
         cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
         self._parking.update(now, idle, self.chargers.charging, facts, cells)
 

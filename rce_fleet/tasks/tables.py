@@ -6,6 +6,7 @@ kept, so that the tables of a restarted manager are the ones before. The tables 
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import RevisionError, UnknownTaskError
@@ -24,7 +25,7 @@ from rce_fleet.tasks.records import (
 from rce_fleet.tasks.task import Task, TaskState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator, KeysView
 
 WITH_ROBOT = frozenset({TaskState.RUNNING, TaskState.SUSPENDED, TaskState.CANCELLING})
 """States in which a task occupies its robot; a held task does while its load is on the robot."""
@@ -63,6 +64,11 @@ class FleetTables:
         self.number = 0
         self.last_task = 0
         self._open: dict[int, None] = {}
+        self._by_state: dict[TaskState, dict[int, None]] = {state: {} for state in TaskState}
+        self._recurring: dict[int, None] = {}
+        """Tasks of which another occurrence follows, ended or not."""
+        self._used_cells: Counter[int] = Counter()
+        """How many open tasks name a cell."""
         self._by_robot: dict[str, int] = {}
         self._queues: dict[str, dict[int, None]] = {}
         self._by_key: dict[tuple[str, str], dict[int, None]] = {}
@@ -114,6 +120,8 @@ class FleetTables:
         """Forget a task that has ended, and its key with the last occurrence that has it."""
         task = self.tasks.pop(number)
         self._open.pop(number, None)
+        self._recurring.pop(number, None)
+        self._leave_indexes(task)
         numbers = self._by_key.get((task.requester, task.key), {})
         numbers.pop(number, None)
         if not numbers:
@@ -147,9 +155,40 @@ class FleetTables:
     def open_tasks(self) -> Iterator[Task]:
         """Return the tasks that have not ended, oldest first."""
         for number in list(self._open):
-            task = self.tasks.get(number)
-            if task is not None and not task.has_ended:
-                yield task
+            if number in self._open:  # it may end, or be forgotten, while others are looked at
+                yield self.tasks[number]
+
+    def open_numbers(self) -> KeysView[int]:
+        """Return the numbers of the tasks that have not ended."""
+        return self._open.keys()
+
+    def used_cells(self) -> KeysView[int]:
+        """Return the cells that the orders of tasks name that have not ended."""
+        return self._used_cells.keys()
+
+    def recurring_tasks(self) -> list[Task]:
+        """Return the tasks of which another occurrence follows."""
+        return [self.tasks[number] for number in self._recurring]
+
+    def numbers(self, states: Collection[str] = ()) -> list[int]:
+        """Return the numbers of tasks, ascending.
+
+        Args:
+            states: States, or ``open``, ``ended`` and ``recurring``; empty: all tasks.
+        """
+        if not states:
+            return sorted(self.tasks)
+        found: set[int] = set()
+        for state in states:
+            if state == "open":
+                found.update(self._open)
+            elif state == "ended":
+                found.update(self.tasks.keys() - self._open.keys())
+            elif state == "recurring":
+                found.update(self._recurring)
+            else:
+                found.update(self._by_state[TaskState(state)])
+        return sorted(found)
 
     def active_tasks(self) -> list[Task]:
         """Return the tasks that occupy robots, oldest first."""
@@ -210,6 +249,8 @@ class FleetTables:
 
     def _put_task(self, task: Task) -> None:
         before = self.tasks.get(task.number)
+        if before is not None:
+            self._leave_indexes(before)
         self.tasks[task.number] = task
         self.last_task = max(self.last_task, task.number)
         if task.key:
@@ -218,12 +259,28 @@ class FleetTables:
             self._open.pop(task.number, None)
         else:
             self._open[task.number] = None
+            self._used_cells.update(task.order.cells())
+        self._by_state[task.state][task.number] = None
+        if task.recurs_at is None:
+            self._recurring.pop(task.number, None)
+        else:
+            self._recurring[task.number] = None
         if before is not None:
             self._leave_robot(before)
         if task.robot and (task.state in WITH_ROBOT or task.state is TaskState.HELD):
             self._by_robot[task.robot] = task.number
         elif task.state is TaskState.ASSIGNED:
             self._queues.setdefault(task.robot, {})[task.number] = None
+
+    def _leave_indexes(self, before: Task) -> None:
+        """Remove a task's former record from the indexes by state and cell."""
+        number = before.number
+        self._by_state[before.state].pop(number, None)
+        if not before.has_ended:
+            for cell in before.order.cells():
+                self._used_cells[cell] -= 1
+                if not self._used_cells[cell]:
+                    del self._used_cells[cell]
 
     def _leave_robot(self, before: Task) -> None:
         """Remove a task's former record from the indexes by robot."""

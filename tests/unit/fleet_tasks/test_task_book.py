@@ -138,3 +138,41 @@ def test_events_make_the_same_book_again(book: TaskBook) -> None:
     copy.grid = book.grid
     assert copy.create(DELIVERY, 4.0, user="erp", key="order-1").id == task.id
     assert copy.create(GO, 4.0).id == "T3"
+
+
+def test_lists_of_tasks_follow_each_change(book: TaskBook) -> None:
+    """By state, recurrence and cell, as all tasks tell."""
+
+    def check() -> None:
+        tasks = list(book.tasks.values())
+        for state in TaskState:
+            assert book.numbers([state.value]) == [task.number for task in tasks if task.state is state]
+        open_tasks = [task for task in tasks if not task.has_ended]
+        assert book.numbers(["open"]) == [task.number for task in open_tasks] == list(book.open_numbers())
+        assert book.numbers(["ended", "held"]) == [
+            task.number for task in tasks if task.has_ended or task.state is TaskState.HELD
+        ]
+        recurring = [task for task in tasks if task.recurs_at is not None]
+        assert (sorted(book.recurring_tasks(), key=lambda task: task.number), book.numbers()) == (
+            recurring,
+            [task.number for task in tasks],
+        )
+        assert set(book.used_cells()) == {cell for task in open_tasks for cell in task.order.cells()}
+
+    orders = [Order((Stop(Action.GO, (cell, 12)),), every=every) for cell, every in ((3, None), (4, 60.0))]
+    for order in (*orders, *orders):
+        book.create(order, 0.0)
+        check()
+    book.hold("T1", 1.0)
+    check()
+    book.change("T1", Order((Stop(Action.GO, (17,)), Stop(Action.GO, (17,)))), 2.0)
+    check()
+    assert 17 in book.used_cells()
+    book.change("T1", orders[0], 2.0)
+    assert 17 not in book.used_cells()
+    for task in ("T1", "T2", "T3"):
+        book.cancel(task, 3.0)
+        check()
+    for number in (1, 2):
+        book.forget(number)
+        check()
