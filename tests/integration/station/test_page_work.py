@@ -173,12 +173,13 @@ async def test_an_undo_that_fails_can_be_tried_again(tmp_path: Path) -> None:
         assert not client.manager.book.blocked.cells
 
 
-async def test_undo_of_a_mode_sets_the_one_before(tmp_path: Path) -> None:
+async def test_undo_of_a_mode_sets_the_one_before() -> None:
     """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
-    async with managed(tmp_path) as (made, _, page):
+    async with site() as made:
+        page = await made.open()
         await page.evaluate("rceFleet.actions.setMode('automatic')")  # as it is already
         await page.locator("#undo:enabled").click()
-        await page.locator("#message", has_text="undone").wait_for()
+        await page.locator("#undo:disabled").wait_for()
         made.feed.on_change(made.view.on_changes({**changes(), "mode": "stopped"}))
         await page.locator("#fleet-resume").click()
         await page.locator("#question", has_text="the fleet is stopped").wait_for()
