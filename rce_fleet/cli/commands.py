@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce.printable import for_terminal, one_line
-from rce_fleet.cli import tasks
+from rce_fleet.cli import tasks, zones
 from rce_fleet.cli.access import (
     STATION,
     AsJson,
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True)
 app.add_typer(tasks.app, name="task")
+app.add_typer(zones.app, name="zone")
 app.command("tasks")(tasks.tasks)
 
 
@@ -132,7 +133,7 @@ def put_in(robot: Robot, station: Station = STATION) -> None:
 
 @app.command("block")
 def block(cells: Cells, station: Station = STATION) -> None:
-    """Block cells for all robots."""
+    """Block cells for all robots; a zone can also have a reason and an end."""
     _set_blocked(cells, station, blocked=True)
 
 

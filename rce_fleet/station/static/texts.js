@@ -280,14 +280,18 @@ const TEXTS = {
   "zoom.out": "Zoom out",
   "zone.blocked": "blocked (no value)",
   "zone.cost": "more cost (factor)",
+  "zone.edges": "Moves that are not allowed (12>13, 13>12), of a blocked zone",
   "zone.kind": "Rule",
   "zone.make": "Make the zone",
   "zone.name": "Name",
   "zone.oneWay": "one way (0 right, 90 up, 180 left, 270 down)",
+  "zone.reason": "Reason",
   "zone.remove": "Remove the zone",
+  "zone.robots": "Only for these robots (Robot1, Robot2)",
   "zone.room": "room for so many robots",
   "zone.slow": "slow (m/s)",
   "zone.title": "New zone",
+  "zone.until": "Until",
   "zone.value": "Value",
 };
 

@@ -1,7 +1,5 @@
 // The form for a zone: a new one after its cells were dragged over, or the one that was clicked.
 
-import { t } from "./texts.js";
-
 // Directions are degrees on the page, and radians for the manager.
 const DEGREE = Math.PI / 180;
 
@@ -16,6 +14,10 @@ export class ZoneForm {
     this.name = document.querySelector("#zone-name");
     this.kind = document.querySelector("#zone-kind");
     this.value = document.querySelector("#zone-value");
+    this.reason = document.querySelector("#zone-reason");
+    this.until = document.querySelector("#zone-until");
+    this.robots = document.querySelector("#zone-robots");
+    this.edges = document.querySelector("#zone-edges");
     this.remove = document.querySelector("#zone-remove");
     tools.addEventListener("zone", ({ detail }) => this.#open(detail));
     tools.addEventListener("chosen", () => this.#close());
@@ -37,6 +39,10 @@ export class ZoneForm {
     const value = known?.value ?? null;
     if (value === null) this.value.value = "";
     else this.value.value = known.kind === "one_way" ? Math.round(value / DEGREE) : value;
+    this.reason.value = known?.reason ?? "";
+    this.until.value = known?.until ? localTime(known.until) : "";
+    this.robots.value = known?.robots.join(", ") ?? "";
+    this.edges.value = known?.edges.map(([from, to]) => `${from}>${to}`).join(", ") ?? "";
     this.remove.hidden = !known;
     this.form.hidden = false;
     this.kind.focus();
@@ -56,9 +62,30 @@ export class ZoneForm {
   async #submit() {
     const { kind, name, value } = this;
     const number = value.value === "" ? null : value.valueAsNumber * (kind.value === "one_way" ? DEGREE : 1);
-    const { reason = t("zone.title"), until = null, robots = [], edges = [] } = this.#zone ?? {};
-    const rule = { kind: kind.value, value: number, edges: kind.value === "blocked" ? edges : [] };
-    const zone = { ...rule, cells: this.#cells, reason, until, robots };
+    const words = (text) => text.split(",").map((word) => word.trim()).filter(Boolean);
+    const zone = {
+      kind: kind.value,
+      value: number,
+      cells: this.#cells,
+      reason: this.reason.value,
+      until: this.#end(),
+      robots: words(this.robots.value),
+      edges: words(this.edges.value).map((move) => move.split(">").map(Number)),
+    };
     if (await this.actions.makeZone(name.value, zone, this.#zone)) this.#close();
   }
+
+  // When it ends, seconds since 1970; an end that was not changed keeps its fractions.
+  #end() {
+    const text = this.until.value;
+    if (!text) return null;
+    const before = this.#zone?.until;
+    return before && localTime(before) === text ? before : new Date(text).getTime() / 1000;
+  }
+}
+
+// A time as the input for it has it.
+function localTime(seconds) {
+  const at = new Date(1000 * seconds);
+  return new Date(at.getTime() - 60000 * at.getTimezoneOffset()).toISOString().slice(0, 16);
 }

@@ -14,7 +14,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from typer.testing import CliRunner
 
-from rce_fleet.api.fleet import FleetRobotModel, RobotList, StatisticsModel
+from rce_fleet.api.fleet import FleetRobotModel, RobotList, StatisticsModel, ZoneList, ZoneModel
 from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
 from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
 from rce_fleet.cli.commands import app as commands
@@ -62,6 +62,7 @@ ROBOT = FleetRobotModel.model_validate(
         "revision": 1,
     }
 )
+ZONE = ZoneModel(id="gate", kind="blocked", cells=[4], edges=[[12, 13]], user="ada", revision=1)
 FIGURES = StatisticsModel.model_validate(dict.fromkeys(StatisticsModel.model_fields, 0))
 
 
@@ -90,6 +91,10 @@ class Station:
             shown = RobotList(robots=[ROBOT]).model_dump_json()
         elif path == "tasks" and request.method == "GET":
             shown = TaskPage(tasks=[TASK], next=None).model_dump_json()
+        elif path == "zones":
+            shown = ZoneList(zones=[ZONE]).model_dump_json()
+        elif path.startswith("zones/"):
+            shown = ZONE.model_dump_json()
         elif path == "statistics":
             shown = FIGURES.model_dump_json()
         else:
@@ -215,6 +220,33 @@ async def test_rce_fleet_adds_a_recurring_task(station: Station, url: str) -> No
         code, told = await run(url, "task", "add", "--cell", "5", *wrong)
         assert (code, f"Invalid value for {value}" in told) == (2, True), told
     assert len(station.bodies) == 2
+
+
+async def test_rce_fleet_makes_lists_and_removes_zones(station: Station, url: str) -> None:
+    """With a reason, an end, robots and moves."""
+    now = time.time()
+    words = ["--kind", "slow", "--value", "0.2", "--robot", "R1", "--reason", "wet", "--for", "60"]
+    assert await run(url, "zone", "add", "gate", "4", "5", *words) == (
+        0,
+        "zone gate: blocked, 1 cells, 1 moves\n",
+    )
+    (body,) = station.bodies
+    assert now + 60 <= body.pop("until") <= time.time() + 60
+    assert body == {
+        "kind": "slow",
+        "value": 0.2,
+        "cells": [4, 5],
+        "edges": [],
+        "robots": ["R1"],
+        "reason": "wet",
+    }
+    assert (await run(url, "zone", "add", "gate", "--edge", "12>13"))[0] == 0
+    assert station.bodies[-1]["edges"] == [[12, 13]]
+    code, told = await run(url, "zone", "add", "gate", "--edge", "12")
+    assert (code, "a move is written as 12>13" in told) == (2, True)
+    assert "gate  blocked  -      4 12>13  all     -      ada" in (await run(url, "zone", "list"))[1]
+    assert await run(url, "zone", "remove", "gate") == (0, "zone gate is removed\n")
+    assert station.changes == ["PUT zones/gate", "PUT zones/gate", "DELETE zones/gate"]
 
 
 @pytest.mark.parametrize(

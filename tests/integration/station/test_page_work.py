@@ -173,6 +173,32 @@ async def test_an_undo_that_fails_can_be_tried_again(tmp_path: Path) -> None:
         assert not client.manager.book.blocked.cells
 
 
+async def test_a_zone_has_a_reason_an_end_robots_and_moves(tmp_path: Path) -> None:
+    """A zone that is changed shows them, and keeps what was not changed."""
+    async with managed(tmp_path) as (_, client, page):
+        await page.locator("#tool-zone").click()
+        await page.evaluate("rceFleet.tools.use(18)")
+        fields = {"reason": "repair", "until": "2099-05-01T12:30", "edges": "20>21, 21>20"}
+        for name, text in fields.items():
+            await page.locator(f"#zone-{name}").fill(text)
+        await page.locator("#zone-kind").select_option("blocked")
+        await page.locator("#zone-form [type=submit]").click()
+        await page.wait_for_function("rceFleet.work.zones.length === 1")
+        zone = client.manager.book.zones["zone1"]
+        assert (zone.reason, zone.cells, zone.edges) == ("repair", (18,), ((20, 21), (21, 20)))
+        local = time.mktime((2099, 5, 1, 12, 30, 0, 0, 0, -1))
+        assert zone.until is not None
+        assert abs(zone.until - local) < 86400  # the browser's time zone may be another one
+        await page.evaluate("rceFleet.tools.use(18)")
+        assert await page.locator("#zone-until").input_value() == fields["until"]
+        await page.locator("#zone-edges").fill("")
+        await page.locator("#zone-robots").fill("Robot1, Robot2")
+        await page.locator("#zone-form [type=submit]").click()
+        await page.wait_for_function("rceFleet.work.zones[0].robots.length === 2")
+        changed = client.manager.book.zones["zone1"]
+        assert (changed.robots, changed.until, changed.reason) == (("Robot1", "Robot2"), zone.until, "repair")
+
+
 async def test_undo_of_a_mode_sets_the_one_before() -> None:
     """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
     async with site() as made:
