@@ -115,8 +115,9 @@ async def measure_engine(
     print("results:", save("engine", results))
 
 
-async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
-    """Run the chosen suites, and the programs that belong to them."""
+async def measure(names: list[str], *, quick: bool, runtime: str) -> int:
+    """Run the chosen suites, and the programs that belong to them; return how many programs failed."""
+    failed = 0
     chosen = suites(quick=quick)
     parts = names or [*chosen, *WITHOUT_ENGINE]
     of_engine = [name for name in parts if name in chosen]
@@ -128,7 +129,9 @@ async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
             argv = [sys.executable, "-m", f"benchmarks.{program}", *options, *short]
             other = await asyncio.create_subprocess_exec(*argv, cwd=ROOT)
             if await other.wait():
+                failed += 1
                 print(f"benchmarks.{program} {' '.join(options)} failed", file=sys.stderr)
+    return failed
 
 
 def main() -> None:
@@ -140,7 +143,7 @@ def main() -> None:
     )
     parser.add_argument("--runtime", default="auto", choices=("auto", "namespace", "process"))
     options = parser.parse_args()
-    uvloop.run(measure(options.only, quick=options.quick, runtime=options.runtime))
+    sys.exit(1 if uvloop.run(measure(options.only, quick=options.quick, runtime=options.runtime)) else 0)
 
 
 if __name__ == "__main__":

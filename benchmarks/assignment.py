@@ -5,7 +5,7 @@ the assignment with the smallest sum, the least of some. ``new grid``: the dista
 first, in slices between which the manager answers; the longest slice and all of them.
 
 Times are those of the processor that the thread used, so that other load does not count. The map is that of
-MovingAI's benchmarks, in the folder ``RCE_DATA``; without it, shelves of the same shape are drawn.
+MovingAI's benchmarks, in the folder ``RCE_DATA``.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
 import time
@@ -16,6 +17,18 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def data() -> Path:
+    """Return the folder of public maps and logs: ``$RCE_DATA``, or ``shared/data`` beside the checkout.
+
+    Raises:
+        SystemExit: It does not exist.
+    """
+    folder = Path(os.environ.get("RCE_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        raise SystemExit(f"there is no folder {folder}: set RCE_DATA to the folder of public maps and logs")
+    return folder
 
 
 def percentile(values: Sequence[float], share: float) -> float:

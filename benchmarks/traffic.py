@@ -2,26 +2,25 @@
 
 It needs no engine. ``tick``: robots drive on warehouse-10-20-10-2-1, each with a pose and a report in every
 tick of 0.1 s. A tick is all of it: serialized poses in, reports in, grants and changes of the state out.
-``block``: a cell on many robots' paths is blocked; the time until the last of them has its new path.
+Ticks that take over a part of a plan are ticks too. ``block``: a cell on many robots' paths is blocked; the
+time of the planner's work and of the plan until the last of them has its new path, without the waits for the
+tick (0.1 s at most) and for the process that makes plans.
 ``memory``: what a robot adds to the planner.
 
 Times are those of the processor that the thread used, so that other load does not count. The map is that of
-MovingAI's benchmarks, in the folder ``RCE_DATA``; without it, shelves of the same shape are drawn. 1000
-robots need a compiled planner (``RCE_COMPILED=yes``).
+MovingAI's benchmarks, in the folder ``RCE_DATA``. 1000 robots need a compiled planner (``RCE_COMPILED=yes``).
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
-import os
 import tracemalloc
-from pathlib import Path
 from random import Random
 from time import perf_counter, thread_time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from benchmarks.figures import percentile, save, show
+from benchmarks.figures import data, percentile, save, show
 from benchmarks.fleet import Fleet
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Time, TypeRegistry
@@ -33,10 +32,12 @@ from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.settings import COMPILED_EFFORT, FleetSettings
 from rce_fleet.nodes.robot_messages import read_pose_seen
 from rce_fleet.nodes.state_publisher import changes_fields
-from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
 from rce_fleet.planning.planner import load_planner
 from rce_fleet.planning.rerouting import REROUTING_KERNELS
+
+if TYPE_CHECKING:
+    from rce_fleet.planning.grid import GridMap
 
 TICK_LIMIT_MS = 100
 """99 of 100 ticks of 1000 robots take at most this."""
@@ -48,18 +49,8 @@ _MESSAGES = TypeRegistry(PackageIndex([]))
 
 
 def warehouse() -> GridMap:
-    """Return the map of the benchmarks, or one of the same shape."""
-    folder = os.environ.get("RCE_DATA")
-    if folder and (Path(folder) / "maps" / _MAP).exists():
-        return read_map(Path(folder) / "maps" / _MAP)
-    rows, columns = 63, 161
-    shelves = frozenset(
-        row * columns + column
-        for row in range(2, rows - 2)
-        for column in range(20, columns - 20)
-        if row % 3 and column % 11
-    )
-    return GridMap(rows, columns, blocked=shelves)
+    """Return the map of the benchmarks."""
+    return read_map(data() / "maps" / _MAP)
 
 
 class Traffic:
@@ -88,6 +79,7 @@ class Traffic:
         self._changes = _MESSAGES.message("fleet/FleetChanges")
         self._poses = _MESSAGES.message("geometry_msgs/PoseWithCovarianceStamped")
         self.sent = 0
+        self._made: PlanMade | None = None
         for robot, cell in zip(self._progress, self.rng.sample(grid.free, count), strict=True):
             self.fleet.places[robot] = grid.centre(cell)
             self._progress[robot] = self.rng.random()
@@ -110,14 +102,20 @@ class Traffic:
             )
 
     def tick(self) -> float:
-        """Let a tenth of a second pass; return the seconds of work of the planner node."""
+        """Let a tenth of a second pass; return the seconds of work of the planner node.
+
+        They include what the node does with a plan: it takes over a part with each event.
+        """
         fleet = self.fleet
         fleet.now += 0.1
         for robot in self._progress:
             self._move(robot)
         poses = [(robot, self._serialized(robot)) for robot in self._progress]
         reports = [fleet.report(robot) for robot in self._progress]
+        made, self._made = self._made, None
         began = thread_time()
+        if made is not None:
+            self.send(fleet.planner.handle(made, fleet.now))
         for robot, pose in poses:
             event = read_pose_seen(robot, self._poses.deserialize(pose))
             self.send(fleet.planner.handle(event, fleet.now))
@@ -129,8 +127,16 @@ class Traffic:
             fields = changes_fields(STARTED, changes, changes.sequence, fleet.now)
             self._changes.serialize(self._changes.new(**fields))
         took = thread_time() - began
-        self.plan()
+        if fleet.requests:  # The process beside the node makes the plan: its answer comes with the next tick.
+            self._made = PlanMade(compute_plan(fleet.requests.pop(), self.made_by))
         return took
+
+    def settle(self) -> None:
+        """Take over the plan that was made last, and all that follow from it."""
+        if self._made is not None:
+            self.send(self.fleet.planner.handle(self._made, self.fleet.now))
+            self._made = None
+        self.plan()
 
     def _serialized(self, robot: str) -> bytes:
         """Return the robot's pose as it comes over the network."""
@@ -184,6 +190,7 @@ def block_times(traffic: Traffic, count: int, times: int) -> list[dict[str, Any]
     gc.collect()
     gc.freeze()  # as the node and its process for plans do
     for _ in range(times):
+        traffic.settle()
         users: dict[int, set[str]] = {}
         claimed: set[int] = set()
         goals = {record.goal for record in fleet.planner.state.robots.values()}
@@ -247,7 +254,7 @@ def measure(*, quick: bool, planner: str) -> None:
         ticks.append(tick_times(traffic, count, 100 if quick else 300))
         blocks += block_times(traffic, count, 5 if quick else 20)
     show(f"Tick of the planner node, planner {planner}", ticks)
-    show("From a blocked cell to the last new path", blocks)
+    show("From a blocked cell to the last new path, without waits for tick and process", blocks)
     sizes_of = [memory(count, planner) for count in sizes[:2]]
     show("Memory of the planner", sizes_of)
     print("results:", save("traffic", {"tick": ticks, "block": blocks, "memory": sizes_of}))
