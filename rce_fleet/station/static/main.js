@@ -2,6 +2,7 @@
 
 import { Actions } from "./actions.js";
 import { Attention } from "./attention.js";
+import { AuditPanel } from "./audit_panel.js";
 import { describeCell } from "./cell_text.js";
 import { Connection } from "./connection.js";
 import { Drive } from "./drive.js";
@@ -62,6 +63,7 @@ const tools = new Tools(view, fleet, actions);
 const drive = new Drive(fleet);
 const gestures = new Gestures(view.canvas, view.camera, tools);
 new RobotsTable(fleet, (robot) => answer("show", robot));
+new AuditPanel(fleet);
 new LayerPanel(fleet, layers, view);
 new Figures();
 const world = new World3d(at("#world"), view.scene, fleet);

@@ -11,8 +11,6 @@ export class Panel {
     this.engine = document.querySelector("#engine");
     this.carrier = document.querySelector("#carrier");
     this.events = document.querySelector("#events");
-    this.audit = document.querySelector("#audit");
-    fleet.addEventListener("audit", ({ detail }) => this.addAudit(detail));
     fleet.addEventListener("engine", () => this.drawEngine());
   }
 
@@ -30,15 +28,5 @@ export class Panel {
     item.append(time, element("span", text, tone));
     this.events.prepend(item);
     while (this.events.children.length > MOST_EVENTS) this.events.lastChild.remove();
-  }
-
-  // What an operator or a program did at this station; other operators see it too.
-  addAudit({ time, user, name, subject, detail, done }) {
-    document.querySelector("#audit-section").hidden = false;
-    const item = element("li");
-    const what = `${name.replaceAll("_", " ")} ${subject}${detail ? `: ${detail}` : ""}`;
-    item.append(element("time", new Date(1000 * time).toLocaleTimeString()), element("b", `${user} `), element("span", what, done ? "" : "bad"));
-    this.audit.prepend(item);
-    while (this.audit.children.length > MOST_EVENTS) this.audit.lastChild.remove();
   }
 }

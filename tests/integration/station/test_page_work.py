@@ -253,3 +253,26 @@ async def test_the_cursor_tells_what_is_in_its_cell(tmp_path: Path) -> None:
         box = await page.locator("#map").bounding_box()
         assert box is not None
         assert (x, y) == pytest.approx((box["width"] / 2, box["height"] / 2), abs=2.0)
+
+
+async def test_who_did_what_is_found_and_dated(tmp_path: Path) -> None:
+    """A station sends what it keeps again when the page connects again: it is listed once."""
+    async with managed(tmp_path) as (_, _, page):
+        did = {"type": "audit", "name": "block_cell", "detail": "", "done": True}
+        now = time.time()
+        told = [{**did, "time": now, "user": "anna", "subject": f"cell {cell}"} for cell in range(100)]
+        told.insert(0, {**did, "time": 86400.0 * 365.0, "user": "bert", "subject": "cell 7"})
+        for _ in range(2):
+            await page.evaluate("all => all.forEach((one) => rceFleet.fleet.apply(one))", told)
+        await page.wait_for_function("document.querySelectorAll('#audit li').length === 100")
+        await page.locator("#audit-more").click()
+        assert await page.locator("#audit li").count() == 101
+        assert not await page.locator("#audit-more").is_visible()
+        assert "197" in await page.locator("#audit li", has_text="bert").locator("time").inner_text()
+        await page.locator("#audit-find").fill("BERT")
+        assert await page.locator("#audit li").count() == 1
+        link = page.locator("#audit-csv")
+        assert (await link.get_attribute("href"), await link.is_visible()) == (
+            "/api/v1/history?format=csv",
+            True,
+        )
