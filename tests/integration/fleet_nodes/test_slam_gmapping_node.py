@@ -24,7 +24,7 @@ from rce_fleet.nodes import map_saver
 from rce_fleet.nodes.planar import pose_of, read_map
 from rce_fleet.nodes.slam_gmapping import SlamGmappingNode, SlamGmappingParameters
 
-PATIENCE = 60.0
+PATIENCE = 240.0
 START = Pose(1.0, 1.0, 0.3)
 SETTINGS = SlamGmappingParameters(
     particles=3, linear_update=0.2, angular_update=0.2, map_update_interval=0.0, seed=1
