@@ -309,13 +309,11 @@ class ControlHandler:
 
 
 def _fault_of(command: commands.Request, error: MasterError) -> RequestFault:
-    match error:
-        case RefusedError():
-            code = error.code.value
-        case StoreError() if not isinstance(error, SaveTooLargeError):
-            code = FaultCode.BUSY.value  # this master ends, or its disk is full: a later attempt may succeed
-        case _:
-            code = ""
+    code = ""
+    if isinstance(error, RefusedError):
+        code = error.code.value
+    elif isinstance(error, StoreError) and not isinstance(error, SaveTooLargeError):
+        code = FaultCode.BUSY.value  # this master ends, or its disk is full: a later attempt may succeed
     return RequestFault(code=code, ids=requests.ids_of(command))
 
 
