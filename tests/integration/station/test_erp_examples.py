@@ -72,7 +72,7 @@ async def check_commands(url: str, folder: Path) -> None:
     lines = [
         line[2:] for line in block("console", "$ rce fleet").splitlines() if line.startswith("$ rce fleet")
     ]
-    assert len(lines) == 14
+    assert len(lines) == 17
     said = {}
     for line in lines:
         words = [waiting if word == "T1" else word for word in shlex.split(line.partition(" > ")[0])]
