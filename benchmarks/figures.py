@@ -27,7 +27,9 @@ def data() -> Path:
     """
     folder = Path(os.environ.get("RCE_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not folder.is_dir():
-        raise SystemExit(f"there is no folder {folder}: set RCE_DATA to the folder of public maps and logs")
+        raise SystemExit(
+            f"folder {folder} does not exist: set RCE_DATA to the folder of public maps and logs"
+        )
     return folder
 
 

@@ -47,26 +47,17 @@ def _column(column: str, **where: object) -> Callable[[Rows], float | None]:
 
 def _greatest(column: str, **where: object) -> Callable[[Rows], float | None]:
     """Read the greatest value of a column in the rows in which other columns have these values."""
-
-    def read(rows: Rows) -> float | None:
-        found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
-        return max(
-            (number for row in found if (number := _number(row.get(column))) is not None), default=None
-        )
-
-    return read
+    return lambda rows: max(_values(rows, column, where), default=None)
 
 
 def _least(column: str, **where: object) -> Callable[[Rows], float | None]:
     """Read the least value of a column in the rows in which other columns have these values."""
+    return lambda rows: min(_values(rows, column, where), default=None)
 
-    def read(rows: Rows) -> float | None:
-        found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
-        return min(
-            (number for row in found if (number := _number(row.get(column))) is not None), default=None
-        )
 
-    return read
+def _values(rows: Rows, column: str, where: Mapping[str, object]) -> list[float]:
+    found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
+    return [number for row in found if (number := _number(row.get(column))) is not None]
 
 
 def _number(value: object) -> float | None:

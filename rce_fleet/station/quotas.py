@@ -1,8 +1,8 @@
 """What one user may ask of a station: requests in a second, streams of events and pages at the same time.
 
 Users share the station's event loop, and the fleet manager behind it: one of them must not take it from the
-others. Requests are counted as the engine counts them, not for administrators. An emergency stop counts for
-nobody.
+others. Requests are counted as the engine counts them, not for administrators. An emergency stop is
+never counted.
 """
 
 from __future__ import annotations

@@ -135,7 +135,7 @@ class UsageViews:
         )
 
     def _movable(self, id_: str) -> advice.Movable | None:
-        """Return a container that can move by itself; None if it cannot, or is no container.
+        """Return a container that can move by itself; None if it cannot, or is not a container.
 
         Those in a network of a group move with others, and those with volumes need a disk, too.
         """

@@ -183,7 +183,7 @@ class SnapshotService:
             offer = msgspec.json.decode(await socket.recv(), type=Offer)
         known = self._state_service.tables.volumes.get(offer.volume)
         if known is None:
-            await self._say(socket, Wanted(error=f"there is no volume {offer.volume!r}"))
+            await self._say(socket, Wanted(error=f"volume {offer.volume!r} does not exist"))
             return
         with self._sparing(offer.contents):
             answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))

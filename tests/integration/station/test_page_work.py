@@ -37,7 +37,7 @@ class ManagedPlanner(Planner):
     client: ManagerClient
 
     def forget_requests(self) -> None:
-        """Keep none: there is no wire to a planner."""
+        """Keep none: no planner is connected."""
 
     def forget_cell(self, cell: int) -> None:
         del cell
