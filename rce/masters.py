@@ -46,7 +46,7 @@ def split_port(address: str, default: int) -> tuple[str, int]:
 class Masters:
     """Addresses of which one stays in use until it fails; then the others are used in turn.
 
-    A connection that worked and ended does not count as a failure: its master is tried first, and the others after it.
+    A connection that worked and ended does not count as a failure: its master is tried first, then others.
 
     Args:
         addresses: One or several; in a text they are separated by commas.

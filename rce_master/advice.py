@@ -165,7 +165,7 @@ def for_machine(room: Room, others: Sequence[Room], containers: Iterable[Movable
 
 
 def is_too_full(room: Room) -> bool:
-    """Return whether more of a machine is promised than should be; one that is being emptied does not count."""
+    """Return whether more of a machine is promised than should be; one that is emptied does not count."""
     return not room.draining and _fullest(room) > NEARLY_FULL
 
 
