@@ -8,6 +8,11 @@ from typing import Any
 
 from rce.ros.xmlrpc.batches import MAX_BYTES, MAX_CALLS
 
+STOPPED_S = 2.0
+"""An event loop that is later than this was stopped, or its machine was suspended."""
+AFTER_STOP_S = 1.0
+"""What a request that ran out of time meanwhile has left."""
+
 
 class RpcRequest:
     """Calls that one caller waits for.
@@ -90,6 +95,8 @@ class RequestQueue:
     async def wait(self, request: RpcRequest) -> list[Any]:
         """Wait for the answers of a request.
 
+        While this program itself is stopped, the server cannot be late: there is time for an answer after it.
+
         Raises:
             TimeoutError: The server did not answer it in time; or none of the others, while it waited.
             XmlRpcError: It failed.
@@ -100,7 +107,10 @@ class RequestQueue:
             left = since + request.timeout - loop.time()
             if left <= 0:
                 raise TimeoutError
+            end = loop.time() + left
             await asyncio.wait((request.answer,), timeout=left)
+            if loop.time() - end > STOPPED_S:
+                await asyncio.wait((request.answer,), timeout=AFTER_STOP_S)
         return request.answer.result()
 
     def drop(self, request: RpcRequest) -> None:

@@ -153,6 +153,12 @@ class Judge:
                 writer.close()
 
 
+def _continue(process: asyncio.subprocess.Process) -> None:
+    """Let a stopped process go on, unless it has ended."""
+    if process.returncode is None:
+        process.send_signal(signal.SIGCONT)
+
+
 async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
     async with Core(port=0) as core, AsyncExitStack() as stack:
         judge = await Judge.start(stack, core)
@@ -173,7 +179,7 @@ async def test_a_planner_that_was_hung_leaves_the_fleet_to_its_successor() -> No
         first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=first"))
         await judge.planner_began()
         first.send_signal(signal.SIGSTOP)
-        stack.callback(first.send_signal, signal.SIGCONT)
+        stack.callback(_continue, first)
         await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
         await judge.hears("/spare: the other planner (/fleet/set_goal at ")
         await judge.hears("/spare: another planner serves this fleet")
@@ -195,7 +201,7 @@ async def test_a_hung_planner_is_given_up_after_a_while() -> None:
         first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=first"))
         before = await judge.planner_began()
         first.send_signal(signal.SIGSTOP)
-        stack.callback(first.send_signal, signal.SIGCONT)
+        stack.callback(_continue, first)
         await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
         await judge.hears("accepts connections and does not answer: this one takes over in 30 s")
         await judge.hears("/spare: the other planner has not answered for 30 s: this one takes over")

@@ -93,7 +93,7 @@ def test_unit_that_could_not_start_is_refused(tmp_path: Path) -> None:
     settings.write_text(f"secret_file: {tmp_path}/none\n")
     told = rce(tmp_path, "install-service", "engine", "--system", "--config", str(settings), code=1)
     assert f"rce secret new {tmp_path}/none" in told
-    settings.write_text("masters: {}\n")
+    settings.write_text("mastr: {}\n")
     told = rce(tmp_path, "install-service", "engine", "--config", str(settings), code=2)
     assert "did you mean 'master'" in told
 

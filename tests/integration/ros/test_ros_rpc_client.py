@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, ClassVar
@@ -15,7 +16,7 @@ from support.ros_masters import serving
 
 from rce.dialing import connect_first
 from rce.ros.errors import RpcRefusedError, RpcUnreachableError
-from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, batches, client
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, batches, client, requests
 from rce.ros.xmlrpc.client_connection import ClientConnection
 from rce.ros.xmlrpc.codec import encode_call
 
@@ -60,6 +61,16 @@ async def test_burst_leaves_few_idle_connections() -> None:
     async with RpcClient() as rpc, server() as one:
         await asyncio.gather(*(rpc.call(f"http://127.0.0.1:{one.port}/", "get", ("/a",)) for _ in range(40)))
         assert rpc.connections <= client.MAX_CONNECTIONS
+
+
+async def test_time_in_which_the_client_is_stopped_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGSTOP, or a machine that is suspended: the server is not late."""
+    monkeypatch.setattr(requests, "STOPPED_S", 0.5)
+    async with RpcClient() as rpc, server() as one:
+        call = asyncio.create_task(rpc.call(f"http://127.0.0.1:{one.port}/", "get", ("/a",), timeout=0.3))
+        await asyncio.sleep(0)
+        time.sleep(1.0)
+        assert (await call)[0] == 1
 
 
 async def test_refused_call_is_told_from_a_lost_one() -> None:
