@@ -4,6 +4,7 @@
 
     FleetError
     +-- MapError            a map or scenario file that cannot be read
+    +-- LanesError          a lane graph that does not fit its grid, or its file that cannot be read
     +-- LogError            a log of laser scans, or a trajectory, that cannot be read
     +-- PlanningError       a planning problem that is not well formed, or has no solution
     +-- PlannerError        a planner that is not installed or cannot be loaded
@@ -57,6 +58,10 @@ class MapError(FleetError):
         if self.line:
             place.append(f"line {self.line}")
         return ": ".join((", ".join(place), self.reason)) if place else self.reason
+
+
+class LanesError(FleetError, ValueError):
+    """A lane graph cannot be driven on its grid, or its file cannot be read; the text says why and where."""
 
 
 class PlanningError(FleetError, ValueError):

@@ -196,6 +196,17 @@ class CellAnswer(ApiModel):
     message: str
 
 
+class LaneModel(ApiModel):
+    """A lane that robots may drive."""
+
+    name: str
+    cells: list[int] = Field(description="Its cells in order.")
+    one_way: bool = Field(description="Whether robots drive it only in this order.")
+    speed: float = Field(description="Greatest speed on it, metres per second; 0: not limited.")
+    width: float = Field(description="Metres; 0: every robot fits.")
+    cost: int = Field(description="How much a move on it counts in plans.")
+
+
 class FleetMapModel(ApiModel):
     """The grid. Cells are numbered row by row from 0; row 0 is the lowest."""
 
@@ -206,6 +217,10 @@ class FleetMapModel(ApiModel):
     yaw: float = Field(description="Direction of the columns, radians counter-clockwise from x.")
     walls: list[int]
     blocked: list[int] = Field(description="Blocked cells, walls left out, and cells that will be blocked.")
+    lanes: list[LaneModel] = Field(
+        default_factory=list,
+        description="Lanes that robots keep to, their other cells are walls; empty: all cells can be driven.",
+    )
 
 
 class StatisticsModel(ApiModel):

@@ -35,7 +35,7 @@ class FleetState:
         pending: Cells that will be blocked once no robot claims them; no robot may enter one.
         sensed: Those of both that robots' sensors found blocked, and people did not.
         requested: Those of both that people blocked one by one.
-        zones: Zones of the map.
+        zones: Zones of the map, and lanes.
         mode: The fleet's mode; counts for robots whose own mode is automatic.
         mode_reason: Why the fleet has its mode, and who set it.
         map_version: Changes when cells or zones do.

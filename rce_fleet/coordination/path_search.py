@@ -39,6 +39,7 @@ class Roads:
         closed: Moves ``(from, to)`` that it may not make.
         costs: Steps that entering a cell takes, where it is not 1.
         goals: Cells that robots are sent to: none of them steps aside into one.
+        move_costs: Steps that moves ``(from, to)`` take, where it is not 1.
     """
 
     neighbours: Sequence[Sequence[int]]
@@ -46,6 +47,12 @@ class Roads:
     closed: frozenset[tuple[int, int]]
     costs: Mapping[int, int]
     goals: frozenset[int]
+    move_costs: Mapping[tuple[int, int], int]
+
+    def cost(self, start: int, end: int) -> int:
+        """Return how many steps a move takes."""
+        steps = self.costs.get(end, 1)
+        return max(steps, self.move_costs.get((start, end), 1)) if self.move_costs else steps
 
 
 def find_path(
@@ -141,7 +148,7 @@ class _Search:
             rest = self._rest(other)
             if rest >= FAR:
                 continue
-            pace: float = roads.costs.get(other, 1)
+            pace: float = roads.cost(cell, other) if roads.move_costs else roads.costs.get(other, 1)
             if node < self.seeds:
                 pace = min(pace, (until - time) / 2)  # It may have to give way at once.
             for after, before in self._known.from_step(other, time):
@@ -228,18 +235,18 @@ def moves_to(
 
 def costs_to(goal: int, roads: Roads) -> list[int]:
     """Return the cost of the cheapest way to a goal from each cell, without regard to robots."""
-    if not roads.costs:
+    if not roads.costs and not roads.move_costs:
         return moves_to(goal, roads.neighbours, roads.shut, roads.closed)
-    field = [FAR] * len(roads.neighbours)
-    field[goal] = 0
+    least = [FAR] * len(roads.neighbours)
+    least[goal] = 0
     heap = [(0, goal)]
     while heap:
         cost, cell = heappop(heap)
-        if cost > field[cell] or (cell in roads.shut and cell != goal):
+        if cost > least[cell] or (cell in roads.shut and cell != goal):
             continue
-        through = cost + roads.costs.get(cell, 1)
         for other in roads.neighbours[cell]:
-            if through < field[other] and (other, cell) not in roads.closed:
-                field[other] = through
+            through = cost + roads.cost(other, cell)
+            if through < least[other] and (other, cell) not in roads.closed:
+                least[other] = through
                 heappush(heap, (through, other))
-    return field
+    return least

@@ -46,6 +46,7 @@ from rce_fleet.coordination.refusals import refuse_goal
 from rce_fleet.coordination.robot import Phase, RobotRecord
 from rce_fleet.coordination.robot_watch import NO_POSE, RobotWatch
 from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.coordination.zones import ZoneBook
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.changes import FleetChanges
     from rce_fleet.coordination.snapshot import FleetSnapshot
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.lanes import LaneGraph
 
 
 class FleetPlanner:
@@ -64,12 +66,18 @@ class FleetPlanner:
         settings: Sizes and times.
         first_revision: Number of the first list of cells. If move clients report higher numbers, from
             before a restart of the planner, the next lists continue from those.
+        lanes: Lanes that robots keep to; cells of the grid that are on none have to be walls.
     """
 
     def __init__(
-        self, grid: GridMap, settings: FleetSettings | None = None, *, first_revision: int = 0
+        self,
+        grid: GridMap,
+        settings: FleetSettings | None = None,
+        *,
+        first_revision: int = 0,
+        lanes: LaneGraph | None = None,
     ) -> None:
-        self.state = FleetState(grid)
+        self.state = FleetState(grid, zones=ZoneBook(lanes))
         self.settings = settings or FleetSettings()
         self._first_revision = first_revision
         self._deaf_until: dict[str, float] = {}

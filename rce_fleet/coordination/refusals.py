@@ -26,7 +26,8 @@ def refuse_goal(state: FleetState, record: RobotRecord, cell: int) -> str:
     if cell in state.zones.forbidden(record.id):
         return f"cell {cell} is blocked for {record.id} by a zone; choose another goal"
     if state.is_shut(cell):
-        return f"cell {cell} is blocked; choose another goal"
+        what = "on no lane" if _is_off_lanes(state, cell) else "blocked"
+        return f"cell {cell} is {what}; choose another goal"
     holder = state.index.goals.get(cell, record.id)
     return "" if holder == record.id else f"cell {cell} is the goal of {holder}; choose another goal"
 
@@ -41,7 +42,14 @@ def refuse_block(state: FleetState, cell: int) -> str:
     """Return why a cell can be neither blocked nor freed; empty if it can."""
     if cell not in state.grid:
         return f"cell {cell} is not on the map of {len(state.grid)} cells"
+    if _is_off_lanes(state, cell):
+        return f"cell {cell} is on no lane, so that no robot enters it"
     return f"cell {cell} is a wall" if cell in state.grid.blocked else ""
+
+
+def _is_off_lanes(state: FleetState, cell: int) -> bool:
+    lanes = state.zones.lanes
+    return lanes is not None and cell not in lanes.cells
 
 
 def hindrance(
@@ -70,6 +78,8 @@ def hindrance(
     if cell is None or reachable or (held and not state.ledger.length(record.id)):
         other = min(reachable or held or hull)
         return f"cell {other} is held by {state.ledger.owner(other)}"
+    if _is_off_lanes(state, cell):
+        return "it stands on no lane: drive it onto one by hand"
     if state.is_blocked(cell):
         return "it stands in a blocked cell"
     return ""

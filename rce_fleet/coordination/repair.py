@@ -123,7 +123,7 @@ class PathRepair:
                 for way in roads.neighbours[cell]
                 if way not in roads.shut and (cell, way) not in roads.closed
             ]
-            cell = min(ways, key=lambda way: field[way] + roads.costs.get(way, 1))
+            _, cell = min((field[way] + roads.cost(cell, way), way) for way in ways)
             step += 1.0
             path.append((cell, step))
         state.ledger.insert(record.id, path)
@@ -146,6 +146,7 @@ class PathRepair:
             state.zones.closed(state.grid),
             state.zones.costs_of(robot),
             frozenset(state.index.goals),
+            state.zones.move_costs,
         )
 
     def _field(self, goal: int, forbidden: frozenset[int]) -> list[int]:

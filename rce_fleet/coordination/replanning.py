@@ -59,6 +59,7 @@ class PlanRequest:
         planner: Name of the planner.
         closed: Moves ``(from, to)`` that no robot may make.
         costs: ``(cell, cost of entering it)`` where it is not 1.
+        move_costs: ``(from, to, cost of this move)`` where it is not 1: those of lanes.
         own_costs: ``(indexes of robots, costs)`` where single robots have other costs.
         forbidden: ``(index of a robot, cells that it may not enter)``.
         headings: Heading of each robot at its start, see :mod:`rce_fleet.planning.motion`.
@@ -81,6 +82,7 @@ class PlanRequest:
     planner: str = DEFAULT_PLANNER
     closed: tuple[tuple[int, int], ...] = ()
     costs: tuple[tuple[int, int], ...] = ()
+    move_costs: tuple[tuple[int, int, int], ...] = ()
     own_costs: tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...] = ()
     forbidden: tuple[tuple[int, tuple[int, ...]], ...] = ()
     headings: tuple[int, ...] = ()
@@ -159,6 +161,7 @@ def request_plan(
         planner=DEFAULT_PLANNER if settings.planner == "dijkstra" else settings.planner,
         closed=tuple(sorted(state.zones.closed(state.grid))),
         costs=tuple(sorted(state.zones.costs().items())),
+        move_costs=tuple((start, end, cost) for (start, end), cost in state.zones.move_costs.items()),
         own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
         headings=() if members else tuple(_heading(state, robot) for robot in robots),

@@ -19,6 +19,7 @@ from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lanes import move_costs
 from rce_fleet.planning.rerouting import RoutedRobots, reroute
 
 if TYPE_CHECKING:
@@ -151,19 +152,24 @@ def weighted_graph(
     request: PlanRequest, grid: GridMap
 ) -> tuple[PlanningGraph, dict[int, NDArray[np.int32]] | None]:
     """Return the graph of a request, and the costs of its edges for robots that have their own, by index."""
-    graph = PlanningGraph.from_grid(grid, costs=_cell_costs(request.costs, grid), closed=request.closed)
+    moves = {(start, end): cost for start, end, cost in request.move_costs}
+    costs = _costs(request.costs, moves, grid)
+    graph = PlanningGraph.from_grid(grid, costs=costs, closed=request.closed)
     own: dict[int, NDArray[np.int32]] = {}
     for robots, pairs in request.own_costs:
-        costs = PlanningGraph.from_grid(grid, costs=_cell_costs(pairs, grid), closed=request.closed).costs
-        own |= dict.fromkeys(robots, costs)
+        costs = _costs(pairs, moves, grid)
+        own |= dict.fromkeys(robots, PlanningGraph.from_grid(grid, costs=costs, closed=request.closed).costs)
     return graph, own or None
 
 
-def _cell_costs(pairs: Sequence[tuple[int, int]], grid: GridMap) -> NDArray[np.int32]:
+def _costs(
+    pairs: Sequence[tuple[int, int]], moves: Mapping[tuple[int, int], int], grid: GridMap
+) -> NDArray[np.int32]:
+    """Return the costs of entering cells, or, with lanes, of moves."""
     costs = np.ones(len(grid), dtype=np.int32)
     for cell, cost in pairs:
         costs[cell] = cost
-    return costs
+    return move_costs(costs, moves, grid) if moves else costs
 
 
 def _ints(stored: bytes) -> NDArray[np.int32]:

@@ -14,16 +14,13 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import ZoneError
 from rce_fleet.limits import LEAST_SPEED, MOST_FACTOR, MOST_ROOM, MOST_SPEED
+from rce_fleet.planning.lanes import MOST_COST, NOMINAL_SPEED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rce_fleet.planning.grid import GridMap
-
-NOMINAL_SPEED = 0.5
-"""Speed of robots outside slow zones, metres per second, when costs of slow zones are computed."""
-_MAX_COST = 20
-"""A cell counts at most so much in plans. Paths of single robots are found as if entering it took so long."""
+    from rce_fleet.planning.lanes import LaneGraph
 
 
 class ZoneKind(Enum):
@@ -94,7 +91,7 @@ class Zone:
             factor = NOMINAL_SPEED / self.speed
         elif self.kind is ZoneKind.COST:
             factor = self.cost
-        return max(ceil(min(factor, _MAX_COST)), 1)
+        return max(ceil(min(factor, MOST_COST)), 1)
 
     def applies_to(self, robot: str) -> bool:
         """Return whether the zone's rule is for this robot."""
@@ -149,14 +146,20 @@ class Zone:
 
 
 class ZoneBook:
-    """The zones of a map, and what they mean for a cell, a move or a robot.
+    """The zones of a map, and what they and the lanes below them mean for a cell, a move or a robot.
+
+    Args:
+        lanes: Lanes that robots have to keep to; None: they drive anywhere.
 
     Attributes:
         zones: By id.
+        lanes: See above.
         revision: Grows with each change; 0 before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, lanes: LaneGraph | None = None) -> None:
+        self.lanes = lanes
+        self._off_lanes: frozenset[tuple[int, int]] | None = None
         self.zones: dict[str, Zone] = {}
         self.revision = 0
         self._forget()
@@ -239,12 +242,19 @@ class ZoneBook:
                 against = zone.direction.against(grid.columns)
                 for cell in zone.cells:
                     closed |= {(cell, cell + against), (cell - against, cell)}
-            self._closed = frozenset(
+            if self.lanes is not None and self._off_lanes is None:
+                self._off_lanes = self.lanes.closed(grid)
+            self._closed = (self._off_lanes or frozenset()).union(
                 (start, end)
                 for start, end in closed
                 if start in grid and end in grid and grid.adjacent(start, end)
             )
         return self._closed
+
+    @property
+    def move_costs(self) -> Mapping[tuple[int, int], int]:
+        """The costs of moves ``(from, to)`` on lanes that do not cost 1, for all robots."""
+        return {} if self.lanes is None else self.lanes.costs
 
     def costs(self) -> Mapping[int, int]:
         """Return the cost of entering cells of slow zones and cost zones for all robots; others cost 1."""
@@ -275,14 +285,15 @@ class ZoneBook:
         return found
 
     def speed_limit(self, robot: str, cells: Sequence[int]) -> float:
-        """Return the greatest speed of a robot in some cells, metres per second; infinity without a limit."""
+        """Return the greatest speed of a robot on its way over cells, m/s; infinity without a limit."""
         inside = set(cells)
+        on_lanes = inf if self.lanes is None else self.lanes.speed_limit(cells)
         limits = [
             zone.speed
             for zone in self.of_kind(ZoneKind.SLOW)
             if zone.applies_to(robot) and not inside.isdisjoint(zone.cells)
         ]
-        return min(limits, default=inf)
+        return min([on_lanes, *limits])
 
     def full(self, robot: str, users: Callable[[Zone], set[str]]) -> frozenset[int]:
         """Return the cells of limited zones that have no room for a robot.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from rce_fleet.api.fleet import (
     EventModel,
@@ -12,6 +12,7 @@ from rce_fleet.api.fleet import (
     FleetRobotModel,
     GoalAnswer,
     GoalChange,
+    LaneModel,
     RobotChange,
     RobotList,
 )
@@ -192,6 +193,7 @@ def _show_robot(call: Call, name: str, queues: dict[str, list[str]]) -> FleetRob
 async def fleet_map(call: Call) -> FleetAnswer:
     """Return the grid; a cell that was just blocked or freed is shown so before the planner tells it."""
     grid, kept = call.manager.facts.grid, call.manager.book.blocked
+    lanes = call.manager.facts.lanes
     if grid is None:
         return problem(503, "the planner has not told its map yet; try again later")
     blocked = [cell for cell in kept.cells if cell in grid]
@@ -205,6 +207,7 @@ async def fleet_map(call: Call) -> FleetAnswer:
             yaw=grid.yaw,
             walls=sorted(grid.blocked),
             blocked=sorted(({*call.manager.facts.shut, *blocked} - grid.blocked).difference(freed)),
+            lanes=[LaneModel.model_validate(asdict(lane)) for lane in lanes.lanes] if lanes else [],
         )
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 from rce_fleet.coordination.following import ChangeFollower
 from rce_fleet.manager.zones import read_zone
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.tasks.facts import NOT_DRIVEN, FleetFacts, RobotFacts
 from rce_fleet.tasks.records import TURNED_BY, PlannerRun
 
@@ -77,6 +78,8 @@ class FactKeeper:
         )
         if self._facts.grid is None or grid != self._facts.grid:
             self._facts.grid = grid
+        lanes = tuple(read_lane(lane) for lane in state.get("lanes", ()))
+        self._facts.lanes = LaneGraph(lanes) if lanes else None
         present = {robot["id"] for robot in state["robots"]}
         for name in self._facts.robots.keys() - present:
             self._facts.robots[name].state = "joining"
@@ -188,3 +191,8 @@ class FactKeeper:
             robot.away_since = inf
         elif robot.away_since == inf:
             robot.away_since = now
+
+
+def read_lane(message: dict[str, Any]) -> Lane:
+    """Return the lane of a ``fleet/Lane``."""
+    return Lane(**{**message, "cells": tuple(message["cells"])})

@@ -37,7 +37,7 @@ from rce_fleet.coordination.grid_change import next_planner, refuse_grid
 from rce_fleet.coordination.path_supply import INDEPENDENT
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
-from rce_fleet.exceptions import MapError, PlannerError, ZoneError
+from rce_fleet.exceptions import LanesError, MapError, PlannerError, ZoneError
 from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
@@ -45,7 +45,7 @@ from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters, un
 from rce_fleet.nodes.grid_topics import GridTopics
 from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
 from rce_fleet.nodes.plan_worker import PlanWorker
-from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
+from rce_fleet.nodes.planner_parameters import KNOWN, read_lane_graph, read_settings
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
@@ -68,6 +68,9 @@ SERVICE = "/fleet/set_goal"
 """Every planner provides this service."""
 BAD_PARAMETERS = 2
 """Exit code of a planner that cannot start with its parameters."""
+GRID_OF_LANES = (
+    "the lanes are made for the present cells: change the file of lanes, and start the planner again"
+)
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
 CLIENT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/moveClient/status")
 
@@ -234,6 +237,8 @@ class PlannerNode:
             return {"ok": False, "message": str(error)}
 
     async def _set_grid(self, request: Message) -> dict[str, Any]:
+        if self._planner.state.zones.lanes is not None:
+            return {"ok": False, "message": GRID_OF_LANES}
         choice = self._chooser.read(request)
         reply, grid = await self._chooser.answer(choice, self._refuse_grid, preview=request.preview)
         if grid is not None:
@@ -242,6 +247,10 @@ class PlannerNode:
 
     def _refuse_grid(self, grid: GridMap) -> str:
         """Return why the fleet cannot change to a grid now; empty if it can."""
+        if self._planner.state.zones.lanes is not None:
+            return (
+                "the lanes are made for the present cells: change the file of lanes, and restart the planner"
+            )
         if self._takes_answers:
             return (
                 "the move clients have the grid from their parameters (answers): restart them and the planner"
@@ -335,11 +344,14 @@ async def serve() -> int | None:
             node.log.warning("%s", remark)
         try:
             settings = read_settings(values)
-            chooser = GridChooser(values, make_grid(values))
+            first = make_grid(values)
+            lanes, remarks = read_lane_graph(values, first, settings.robot_radius)
+            chooser = GridChooser(values, first if lanes is None else lanes.restrict(first))
             takes_answers = bool(values.get("answers", False))
-            grid, remark = await chooser.grid_at_start(None if takes_answers else values.get(CHOSEN))
+            is_fixed = takes_answers or lanes is not None
+            grid, remark = await chooser.grid_at_start(None if is_fixed else values.get(CHOSEN))
             blocked = chooser.blocked_at_start(grid)
-        except (ValueError, MapError, PlannerError, OSError) as error:
+        except (ValueError, LanesError, MapError, PlannerError, OSError) as error:
             # With another map or other sizes than those that were meant, robots would not be safe.
             node.log.error("the planner cannot start: %s", error)  # noqa: TRY400 - a user's mistake
             print(f"fleet_planner: {error}", file=sys.stderr)  # noqa: T201
@@ -347,11 +359,11 @@ async def serve() -> int | None:
         warn_of_size(node, grid, settings)
         if not await stand_by(node, "planner", SERVICE):
             return 0
-        if remark:
-            node.log.warning("%s", remark)
+        for text in filter(None, (remark, *remarks)):
+            node.log.warning("%s", text)
         file = file_of_robots(values)
         kept = KnownRobots(file, settings.ahead) if file is not None else None
-        made = FleetPlanner(grid, settings)
+        made = FleetPlanner(grid, settings, lanes=lanes)
         planner = PlannerNode(node, made, chooser, takes_answers=takes_answers, known=kept)
         await planner.run(blocked)
         if not planner.successor:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.coordination.settings import FleetSettings
-from rce_fleet.exceptions import PlannerError
+from rce_fleet.exceptions import LanesError, PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
 from rce_fleet.nodes.grid_parameters import GRID_PARAMETERS, read_count, read_number
+from rce_fleet.planning.lane_files import read_lanes
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import planner_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.lanes import LaneGraph
+
 KNOWN = GRID_PARAMETERS | frozenset(
     {
-        *("blocked", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
+        *("blocked", "lanes", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
     }
 )
@@ -51,3 +56,33 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         known = ", ".join(planner_names())
         raise PlannerError(f"the parameter planner is {settings.planner!r}; installed planners are {known}")
     return settings
+
+
+def read_lane_graph(
+    values: Mapping[str, Any], grid: GridMap, robot_radius: float
+) -> tuple[LaneGraph | None, list[str]]:
+    """Return the lanes of the parameter ``lanes``, and a remark about each that is too narrow for the robots.
+
+    Args:
+        values: The parameters.
+        grid: The grid that the lanes lie on.
+        robot_radius: Metres.
+
+    Returns:
+        The lanes that robots fit on; None: there is no such parameter.
+
+    Raises:
+        LanesError: The file cannot be read, its lanes cannot be driven on the grid, or all are too narrow.
+    """
+    file = values.get("lanes")
+    if not file:
+        return None, []
+    lanes, narrow = read_lanes(Path(str(file)), grid).fitting(2 * robot_radius)
+    remarks = [
+        f"{file}: lane {lane.name!r} is {lane.width:g} m wide, and robots with a radius of {robot_radius:g} m"
+        f" need {2 * robot_radius:g} m: it is not used"
+        for lane in narrow
+    ]
+    if not lanes.lanes:
+        raise LanesError(f"{remarks[0]}; no lane is left")
+    return lanes, remarks

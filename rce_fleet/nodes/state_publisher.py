@@ -8,6 +8,7 @@ topic. Its rate falls with the size of the fleet: up to 20 robots after each cha
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types import Message, Time
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.planner import FleetPlanner
     from rce_fleet.coordination.snapshot import RobotSnapshot
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.lanes import LaneGraph
 
 STATE = "fleet/FleetState"
 STATE_TOPIC = "/fleet/state"
@@ -110,8 +112,14 @@ def state_fields(started: Time, planner: FleetPlanner, now: float = 0.0) -> dict
         "robots": [robot_fields(robot) for robot in snapshot.robots],
         "planner": planner.settings.planner,
         "zones": [zone_fields(zone, now) for _, zone in sorted(planner.state.zones.zones.items())],
+        "lanes": [] if planner.state.zones.lanes is None else lane_fields(planner.state.zones.lanes),
         **fleet_fields(planner),
     }
+
+
+def lane_fields(lanes: LaneGraph) -> list[dict[str, Any]]:
+    """Return the fields of a ``fleet/Lane`` for each lane."""
+    return [{**asdict(lane), "cells": list(lane.cells)} for lane in lanes.lanes]
 
 
 def fleet_fields(planner: FleetPlanner) -> dict[str, Any]:

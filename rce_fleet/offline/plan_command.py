@@ -19,6 +19,7 @@ from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.fields import LANES, UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.lane_files import read_lanes
 from rce_fleet.planning.lifelong import LIFELONG_KERNELS, LifelongPlanner, LifelongSettings
 from rce_fleet.planning.movingai import read_map, read_scenario
 from rce_fleet.planning.planner import (
@@ -48,6 +49,9 @@ def plan(
     ] = None,
     planner: Annotated[str | None, typer.Option(help="Planner, by its name; lacam by default.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of random choices.")] = 0,
+    lanes: Annotated[
+        Path | None, typer.Option(help="File of lanes that robots keep to.", show_default=False)
+    ] = None,
     *,
     lifelong: Annotated[
         bool, typer.Option("--lifelong", help="Give each robot one goal after another.")
@@ -60,7 +64,7 @@ def plan(
     """
     with _errors():
         if lifelong:
-            unused = {"--scen": scen, "--seconds": seconds, "--planner": planner}
+            unused = {"--scen": scen, "--seconds": seconds, "--planner": planner, "--lanes": lanes}
             if given := [name for name, value in unused.items() if value is not None]:
                 raise PlanningError(
                     f"--lifelong has starts, goals and a planner of its own; leave out {', '.join(given)}"
@@ -69,14 +73,17 @@ def plan(
         elif scen is None:
             raise PlanningError("a plan needs --scen FILE.scen with starts and goals, or --lifelong")
         else:
-            report = _one_shot(map_, scen, robots, seconds or 0.0, planner or DEFAULT_PLANNER, seed)
+            name = planner or DEFAULT_PLANNER
+            report = _one_shot(map_, scen, robots, seconds or 0.0, name, seed, lanes)
         output.write_text(json.dumps(report, separators=(",", ":")) + "\n", encoding="utf-8")
     shown = {name: value for name, value in report.items() if not isinstance(value, list)}
     typer.echo(f"{output}: " + ", ".join(f"{name} {value}" for name, value in shown.items()))
 
 
-def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, seed: int) -> dict[str, Any]:
-    """Plan a scenario; return the report."""
+def _one_shot(
+    map_: Path, scen: Path, robots: int, seconds: float, name: str, seed: int, file: Path | None
+) -> dict[str, Any]:
+    """Plan a scenario, on the lanes of a file if there is one; return the report."""
     found: list[float] = []
     began = time.perf_counter()
     planner = load_planner(name)
@@ -84,12 +91,15 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
         planner = LacamPlanner(on_first=lambda _: found.append(time.perf_counter()))
     compile_s = time.perf_counter() - began
     grid = read_map(map_)
+    lanes = None if file is None else read_lanes(file, grid)
+    if lanes is not None:
+        grid = lanes.restrict(grid)
     rows = read_scenario(scen, grid, limit=robots)
     if len(rows) < robots:
         raise PlanningError(f"{scen}: the scenario has {len(rows)} robots; --robots asks for {robots}")
     began = time.perf_counter()
     problem = PlanningProblem.of(
-        PlanningGraph.from_grid(grid),
+        PlanningGraph.from_grid(grid) if lanes is None else lanes.graph(grid),
         [row.start for row in rows],
         [row.goal for row in rows],
         seed=seed,
@@ -109,7 +119,9 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
             f"no plan was found in {found[-1] - began:.1f} s; try more --seconds or another --seed"
         )
     paths = _paths(joint)
-    faults = check_plan(grid, paths, starts=problem.starts.tolist(), goals=problem.goals.tolist())
+    starts, goals = problem.starts.tolist(), problem.goals.tolist()
+    one_way = () if lanes is None else lanes.closed(grid)
+    faults = check_plan(grid, paths, starts=starts, goals=goals, one_way=one_way)
     if faults and joint.conflict_free:
         raise PlanningError(f"the planner {name!r} made a wrong plan; {faults[0]}")
     if faults:
@@ -144,7 +156,7 @@ def _lower_bound(problem: PlanningProblem) -> int:
     total = 0
     for begin in range(0, len(problem.goals), LANES):  # a table for all goals could fill the memory
         starts, goals = problem.starts[begin : begin + LANES], problem.goals[begin : begin + LANES]
-        distances = distance_fields(problem.graph, goals)[np.arange(len(goals)), starts]
+        distances = distance_fields(problem.graph.unweighted, goals)[np.arange(len(goals)), starts]
         if distances.max() >= UNREACHABLE:
             index = int(np.argmax(distances >= UNREACHABLE))
             raise PlanningError(

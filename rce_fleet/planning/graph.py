@@ -1,4 +1,4 @@
-"""The graph that robots are planned on: cells of a grid, or nodes joined by lanes.
+"""The graph that robots are planned on: cells of a grid, or any nodes and edges.
 
 A graph is three arrays in compressed rows (CSR): the nodes that can be entered from node ``v`` are
 ``neighbours[indptr[v]:indptr[v + 1]]``, and entering them costs ``costs[indptr[v]:indptr[v + 1]]``.
@@ -27,8 +27,8 @@ MAX_COST = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
-    """A directed edge of a lane graph.
+class Edge:
+    """A directed edge of a graph that is not a grid.
 
     Attributes:
         start: Node that it leaves.
@@ -86,7 +86,7 @@ class PlanningGraph:
             costs: Cost of entering each cell, shape (cells,), or of leaving each cell down (row - 1), left
                 (column - 1), right and up (row + 1), shape (cells, 4); 1 by default. Slow zones and guidance
                 are costs.
-            closed: Moves ``(from, to)`` that are not allowed, for one-way aisles.
+            closed: Moves ``(from, to)`` of neighbours that are not allowed, for one-way aisles.
         """
         rows, columns = grid.rows, grid.columns
         cells = np.arange(rows * columns, dtype=np.int32)
@@ -96,8 +96,9 @@ class PlanningGraph:
         targets = np.stack([cells - columns, cells - 1, cells + 1, cells + columns], axis=1)
         inside = np.stack([row > 0, column > 0, column < columns - 1, row < rows - 1], axis=1)
         kept = inside & enterable[np.where(inside, targets, 0)]
-        for start, end in closed:
-            kept[start] &= targets[start] != end
+        shut = np.array(list(closed), dtype=np.int32).reshape(-1, 2)
+        which, direction = np.nonzero(targets[shut[:, 0]] == shut[:, 1:])
+        kept[shut[which, 0], direction] = False
         weights = np.ones(targets.shape, dtype=np.int32)
         if costs is not None:
             given = np.asarray(costs, dtype=np.int32)
@@ -107,17 +108,17 @@ class PlanningGraph:
         return cls(indptr, targets[kept].astype(np.int32), weights[kept].astype(np.int32), columns)
 
     @classmethod
-    def from_lanes(cls, nodes: int, lanes: Iterable[Lane]) -> PlanningGraph:
-        """Return a graph of ``nodes`` nodes, numbered from 0, and directed lanes.
+    def from_edges(cls, nodes: int, edges: Iterable[Edge]) -> PlanningGraph:
+        """Return a graph of ``nodes`` nodes, numbered from 0, and directed edges.
 
         Raises:
-            ValueError: A lane leads to a node that does not exist, or from a node to itself.
+            ValueError: An edge leads to a node that does not exist, or from a node to itself.
         """
-        listed = sorted({(lane.start, lane.end): lane.cost for lane in lanes}.items())
+        listed = sorted({(edge.start, edge.end): edge.cost for edge in edges}.items())
         for (start, end), _ in listed:
             if start == end or not (0 <= start < nodes and 0 <= end < nodes):
                 raise ValueError(
-                    f"a lane from {start} to {end}: it must join two of the nodes 0 .. {nodes - 1}"
+                    f"an edge from {start} to {end}: it must join two of the nodes 0 .. {nodes - 1}"
                 )
         indptr = np.zeros(nodes + 1, dtype=np.int32)
         np.add.at(indptr, [start + 1 for (start, _), _ in listed], 1)

@@ -11,6 +11,7 @@ improved by large-neighbourhood search.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -112,7 +113,10 @@ class LacamPlanner:
             steps, distances, cells, part.goals, rotations=problem.rotations, seed=problem.seed
         )
         improver.run(deadline)
-        return JointPlan(part.original(improver.cells), complete, lower_bound=improver.lower_bound)
+        improved = JointPlan(part.original(improver.cells), complete, lower_bound=improver.lower_bound)
+        # The search counts steps: with weights a plan that it made shorter may lead over dear edges.
+        is_better = problem.is_unweighted or _cost(problem, improved) <= _cost(problem, joint)
+        return improved if is_better else replace(joint, lower_bound=improver.lower_bound)
 
     def _plan_in_motion(
         self,
@@ -145,6 +149,7 @@ class LacamPlanner:
                         straighten(cells, len(part.graph), ends)
                     joint = JointPlan(part.original(cells), complete)
                     took = float(execution_times(joint.cells, problem.graph.columns, motion).sum())
+                    took += problem.extra_cost(joint.cells)
                     if (not complete, took) < (not best.complete, least):
                         if self._on_first is not None and complete and not best.complete:
                             self._on_first(joint)
@@ -178,6 +183,10 @@ def plan(
     return LacamPlanner(compiled=False).plan(
         PlanningProblem.of(graph, starts, goals, seed=seed, effort=effort)
     )
+
+
+def _cost(problem: PlanningProblem, joint: JointPlan) -> int:
+    return joint.cost + problem.extra_cost(joint.cells)
 
 
 def _table(part: Compaction, graph: PlanningGraph, own_costs: Mapping[int, Ints]) -> Table:

@@ -114,7 +114,7 @@ def edge_directions(graph: PlanningGraph) -> Ints:
         PlanningError: The graph was not made from a grid, so that it has no directions.
     """
     if not graph.columns:
-        raise PlanningError("turns can be planned on grids only; this graph has lanes without directions")
+        raise PlanningError("turns can be planned on grids only; this graph has edges without directions")
     offsets = graph.neighbours - np.repeat(np.arange(len(graph)), np.diff(graph.indptr))
     found = np.select(
         [offsets == graph.columns, offsets == -graph.columns, offsets == 1], [UP, DOWN, RIGHT], LEFT

@@ -137,6 +137,31 @@ class PlanningProblem:
             own_costs,
         )
 
+    @cached_property
+    def is_unweighted(self) -> bool:
+        """Whether every move costs one step, for all robots."""
+        return self.graph.is_unweighted and not self.own_costs
+
+    def extra_cost(self, cells: Ints) -> int:
+        """Return what the moves of a plan cost beyond their steps, summed over the robots.
+
+        Args:
+            cells: The plan, shape (steps + 1, robots); moves are edges of the graph.
+        """
+        if self.is_unweighted:
+            return 0
+        graph, nodes = self.graph, len(self.graph)
+        sources = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(graph.indptr))
+        keys = sources * nodes + graph.neighbours
+        order = np.argsort(keys, kind="stable")
+        steps, robots = np.nonzero(cells[1:] != cells[:-1])
+        moves = cells[steps, robots].astype(np.int64) * nodes + cells[steps + 1, robots]
+        edges = order[np.searchsorted(keys, moves, sorter=order)]
+        costs = graph.costs[edges]
+        for robot, own in (self.own_costs or {}).items():
+            costs[robots == robot] = own[edges[robots == robot]]
+        return int(costs.sum(dtype=np.int64)) - len(costs)
+
 
 @dataclass(frozen=True, eq=False)
 class JointPlan:

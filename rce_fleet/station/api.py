@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from rce_fleet.api.fleet import LaneModel
 from rce_fleet.api.tasks import numbers_only
 
 MAX_CELL = 2**31 - 1
@@ -142,6 +143,9 @@ class MapModel(_Model):
     yaw: float = Field(default=0.0, description="Direction of the columns, radians counter-clockwise from x.")
     robot_radius: float = Field(description="Metres.")
     walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
+    lanes: list[LaneModel] = Field(
+        default_factory=list, description="Lanes that robots keep to; empty: all cells can be driven."
+    )
 
 
 class FleetModel(_Model):

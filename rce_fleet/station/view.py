@@ -91,6 +91,7 @@ class FleetView:
     def on_state(self, message: dict[str, Any]) -> ViewChange:
         """Set the complete state; remove what is not in it."""
         grid = {key: message[key] for key in _MAP}
+        grid["lanes"] = message.get("lanes", [])  # planners of earlier releases tell none
         robots = {robot["id"]: robot for robot in message["robots"]}
         blocked, pending = set(message["blocked"]), set(message["pending"])
         change = ViewChange(
@@ -200,6 +201,7 @@ class FleetView:
             "yaw": self._yaw,
             "robot_radius": ROBOT_RADIUS,
             "walls": list(self._map["walls"]),
+            "lanes": list(self._map["lanes"]),
         }
 
     def robots(self, names: Iterable[str] | None = None) -> list[dict[str, Any]]:

@@ -105,7 +105,7 @@ class Dispatcher:
         travel, book = self._travel, self._book
         if facts.grid is None or not facts.is_live:
             return False
-        travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
+        travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision, facts.lanes)
         if travel.epoch != self._measured_epoch:
             self._measured_epoch, self._measured = travel.epoch, set()
         self._measured &= book.open_numbers()
@@ -151,7 +151,7 @@ class Dispatcher:
         profiles = map(self.profile, facts.robots)
         self._fastest = max(profiles, key=lambda profile: profile.speed, default=self.rules.profile)
         if facts.grid is not None:
-            self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
+            self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision, facts.lanes)
         users = self._charger_users(facts)
         self._progress.update(now, facts, self._nearest, self._short_of_energy, users)
         self._release_misfits(now)

@@ -10,6 +10,7 @@ from rce_fleet.tasks.records import AUTOMATIC
 
 if TYPE_CHECKING:
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.lanes import LaneGraph
     from rce_fleet.tasks.records import Zone
 
 AT_REST = frozenset({"idle", "arrived"})
@@ -82,6 +83,7 @@ class FleetFacts:
         is_live: Whether the planner is heard.
         is_current: Whether no change of its state was missed.
         grid: The grid, its walls blocked; None before the first state.
+        lanes: Lanes that robots keep to; None: they drive over all cells that are not blocked.
         mode: The fleet's: ``automatic``, ``paused`` or ``stopped``.
         zones: The planner's zones, by name.
         pending: Cells that will be blocked once a robot has left them.
@@ -95,6 +97,7 @@ class FleetFacts:
     is_live: bool = False
     is_current: bool = False
     grid: GridMap | None = None
+    lanes: LaneGraph | None = None
     mode: str = AUTOMATIC
     zones: dict[str, Zone] = field(default_factory=dict)
     pending: frozenset[int] = frozenset()

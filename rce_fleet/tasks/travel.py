@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.lanes import LaneGraph
     from rce_fleet.tasks.records import Zone
 
     Floats = NDArray[np.float32]
@@ -53,7 +54,7 @@ class TravelCosts:
     detour at most, and never leads a robot to a cell that it cannot reach.
 
     Attributes:
-        epoch: Grows when all distances are forgotten: with each new grid.
+        epoch: Grows when all distances are forgotten: with each new grid, and with other lanes.
     """
 
     def __init__(self) -> None:
@@ -61,6 +62,7 @@ class TravelCosts:
         self._shut: frozenset[int] = frozenset()
         self._revision: object = None
         self._zones: dict[str, tuple[int, ...]] = {}
+        self._lanes: LaneGraph | None = None
         self.epoch = 0
         self._graphs: OrderedDict[Costs, Graph] = OrderedDict()
         self._parts: dict[Costs, _Parts] = {}
@@ -75,7 +77,12 @@ class TravelCosts:
         self._own_budget = max(REFRESHED, CELLS_PER_STEP // max(1, len(self._grid or ())))
 
     def set_map(
-        self, grid: GridMap, shut: frozenset[int], zones: Mapping[str, Zone], revision: object
+        self,
+        grid: GridMap,
+        shut: frozenset[int],
+        zones: Mapping[str, Zone],
+        revision: object,
+        lanes: LaneGraph | None = None,
     ) -> None:
         """Take a map over, unless it has the revision of the present one.
 
@@ -84,12 +91,15 @@ class TravelCosts:
             shut: Cells that no robot may enter; walls among them.
             zones: Zones, by name.
             revision: Differs for different maps.
+            lanes: Lanes that robots keep to: metres on slow ones count more.
         """
         cells = {name: zone.cells for name, zone in zones.items()}
-        if revision == self._revision and cells == self._zones and grid is self._grid:
+        is_same = grid is self._grid and lanes == self._lanes
+        if revision == self._revision and cells == self._zones and is_same:
             return
-        self._stale = {**self._stale, **self._fields} if grid is self._grid else {}
-        self.epoch += grid is not self._grid
+        self._stale = {**self._stale, **self._fields} if is_same else {}
+        self.epoch += not is_same
+        self._lanes = lanes
         self._grid, self._shut, self._revision, self._zones = grid, shut, revision, cells
         self._graphs.clear()
         self._parts.clear()
@@ -266,10 +276,15 @@ class TravelCosts:
                 weight[inside] *= max(LEAST_FACTOR, factor)  # else no way would be the shortest
         keep = free[heads]
         heads, tails = heads[keep], tails[keep]
+        lengths = (weight[heads] + weight[tails]) / 2
+        if self._lanes is not None:
+            factors = self._lanes.factors(grid, tails, heads)
+            keep = factors > 0
+            heads, tails, lengths = heads[keep], tails[keep], (lengths * factors)[keep]
         order = np.argsort(heads, kind="stable")
-        heads, tails = heads[order], tails[order]
+        heads, tails, lengths = heads[order], tails[order], lengths[order]
         indptr = np.concatenate(([0], np.cumsum(np.bincount(heads, minlength=len(grid)))))
-        return indptr.astype(np.int32), tails, (weight[heads] + weight[tails]) / 2
+        return indptr.astype(np.int32), tails, lengths
 
 
 class _Parts:

@@ -42,10 +42,18 @@ class RestingRobot:
 
     Args:
         node: Running node in the robot's namespace.
+        drives: Whether it is at a goal's place as soon as it has the goal, and says so.
+
+    Attributes:
+        newest: The planner's newest state.
+        places: Where it was, ``(x, y)`` in metres, in order.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, *, drives: bool = False) -> None:
         self._node = node
+        self._drives = drives
+        self._poses: Publisher
+        self.places: list[tuple[float, float]] = []
         self._beating: dict[str, Publisher] = {}
         self._changed = asyncio.Event()
         self._reached: list[dict[str, Any]] = []
@@ -53,12 +61,9 @@ class RestingRobot:
 
     async def start(self, place: tuple[float, float]) -> None:
         """Publish the pose, and follow the planner's state."""
-        poses = await self._node.advertise("amcl_pose", "geometry_msgs/PoseWithCovarianceStamped", latch=True)
-        z, w = quaternion_z(0.5)
-        position = {"x": place[0], "y": place[1]}
-        poses.publish(
-            header={"frame_id": "map"}, pose={"pose": {"position": position, "orientation": {"z": z, "w": w}}}
-        )
+        pose_type = "geometry_msgs/PoseWithCovarianceStamped"
+        self._poses = await self._node.advertise("amcl_pose", pose_type, latch=True)
+        self._be_at(place)
         await self._node.subscribe("/fleet/state", "fleet/FleetState", self._take_state)
         await self._node.subscribe("move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._take_goal)
 
@@ -86,7 +91,17 @@ class RestingRobot:
                 self._changed.clear()
                 await self._changed.wait()
 
+    def _be_at(self, place: tuple[float, float]) -> None:
+        self.places.append(place)
+        z, w = quaternion_z(0.5)
+        position = {"x": place[0], "y": place[1]}
+        pose = {"position": position, "orientation": {"z": z, "w": w}}
+        self._poses.publish(header={"frame_id": "map"}, pose={"pose": pose})
+
     def _take_goal(self, message: Message) -> None:
+        if self._drives:
+            position = message.goal.target_pose.pose.position
+            self._be_at((position.x, position.y))
         goal_id = {"stamp": message.goal_id.stamp, "id": message.goal_id.id}
         self._reached.append({"goal_id": goal_id, "status": SUCCEEDED})
 

@@ -14,5 +14,6 @@ export function describeCell(fleet, zones, cell) {
     if (goal === cell && at !== cell) parts.push(t("cell.goal", { robot: id }));
   }
   for (const { id, cells } of zones) if (cells.includes(cell)) parts.push(t("cell.zone", { zone: id }));
+  for (const { name, cells, one_way } of fleet.map.lanes ?? []) if (cells.includes(cell)) parts.push(t(one_way ? "cell.oneWay" : "cell.lane", { lane: name }));
   return parts.length > 1 ? parts.join(", ") : `${parts[0]}, ${t("cell.free")}`;
 }

@@ -21,6 +21,7 @@ export class LayerPanel {
     this.#addFleet("goals", true, (on) => set("goals", on, "lines"));
     this.#addFleet("trails", false, (on) => set("trails", on ? "all" : "few", "lines"));
     this.#addFleet("zones", true, (on) => set("zones", on, "cells"));
+    this.#addFleet("lanes", true, (on) => set("lanes", on, "overlay"));
     this.#addFleet("congestion", false, (on) => set("congestion", on, "cells"));
     for (const name of LAYERS) this.#add(name, false, (on) => layers.toggle(name, on));
     this.robot.addEventListener("change", () => layers.look(this.robot.value || null));

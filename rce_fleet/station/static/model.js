@@ -9,7 +9,7 @@ const FRAME_HEADER = 16;
 const ROW_BYTES = 20;
 
 export class Fleet extends EventTarget {
-  map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls}; row 0 is the lowest
+  map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls, lanes}; row 0 is the lowest
   robots = new Map();  // id -> {id, state, reason, cell, goal, plan, granted, replans, pose, seen, trail}
   walls = new Set();   // blocked cells that belong to the map
   blocked = new Set();

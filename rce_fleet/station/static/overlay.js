@@ -3,6 +3,7 @@
 const CELL_NUMBER_PX = 34;  // side of a cell, CSS pixels, from which its number is shown
 const NAME_PX = 30;         // the same for names of robots
 const MOST_NAMES = 150;
+const ARROW_EVERY = 4;      // cells between two arrowheads of a one-way lane
 
 export class Overlay {
   preview = null;   // what a tool is about to do: draws itself with (context, camera, colour), and returns whether it drew
@@ -19,6 +20,8 @@ export class Overlay {
     const { context, view } = this;
     if (!this.#isEmpty) context.clearRect(0, 0, view.canvas.width, view.canvas.height);
     const side = (view.fleet.map.cell_size * view.scale) / devicePixelRatio;
+    const lanes = view.scene.shown.lanes ? view.fleet.map.lanes ?? [] : [];
+    if (lanes.length) this.#drawLanes(lanes);
     const hasNumbers = side >= CELL_NUMBER_PX && view.layers.layers.grid;
     if (hasNumbers) this.#drawNumbers();
     this.#drawCursor();
@@ -28,7 +31,7 @@ export class Overlay {
     this.#drawNames(side);
     const hasPreview = this.preview?.(context, view.camera, view.colour);
     const { shown } = view.layers.layers;
-    this.#isEmpty = !hasNumbers && view.cursor === null && !proposed && !shown.size && !this.hasNames && !hasPreview;
+    this.#isEmpty = !lanes.length && !hasNumbers && view.cursor === null && !proposed && !shown.size && !this.hasNames && !hasPreview;
   }
 
   // Go to a grid: the first cell begins at the origin; its columns go right and its rows up (negative).
@@ -66,6 +69,37 @@ export class Overlay {
       if (view.fleet.walls.has(cell)) continue;
       context.fillText(cell, (cell % columns) * side + side * 0.05, -(Math.floor(cell / columns) + 1) * side + side * 0.05);
     }
+    context.restore();
+  }
+
+  // Lanes: a line through the middle of their cells, with arrowheads where they have one direction.
+  #drawLanes(lanes) {
+    const { context, view } = this;
+    const { columns, cell_size } = view.fleet.map;
+    const side = cell_size * view.scale;
+    const middle = (cell) => [((cell % columns) + 0.5) * side, -(Math.floor(cell / columns) + 0.5) * side];
+    this.#enterGrid();
+    context.strokeStyle = context.fillStyle = view.colour.quiet;
+    context.globalAlpha = 0.6; // they lie over the robots
+    context.lineWidth = Math.max(1, side * 0.03);
+    context.lineJoin = "round";
+    context.beginPath();
+    for (const { cells } of lanes) cells.forEach((cell, index) => (index ? context.lineTo(...middle(cell)) : context.moveTo(...middle(cell))));
+    context.stroke();
+    context.beginPath();
+    const reach = side * 0.16;
+    for (const { cells, one_way } of lanes) {
+      if (!one_way) continue;
+      for (let index = 0; index + 1 < cells.length; index += ARROW_EVERY) {
+        const [[x, y], [toX, toY]] = [middle(cells[index]), middle(cells[index + 1])];
+        const [right, down] = [(toX - x) / side, (toY - y) / side];
+        const [tipX, tipY] = [(x + toX) / 2 + right * reach, (y + toY) / 2 + down * reach];
+        context.moveTo(tipX, tipY);
+        for (const across of [-1, 1]) context.lineTo(tipX - (2 * right + across * down) * reach, tipY - (2 * down - across * right) * reach);
+        context.closePath();
+      }
+    }
+    context.fill();
     context.restore();
   }
 

@@ -26,7 +26,7 @@ export class Scene {
   linesVersion = 0;
   robots = new Float32Array(0);
   robotCount = 0;
-  shown = { paths: "all", trails: "few", goals: true, congestion: false, zones: true };
+  shown = { paths: "all", trails: "few", goals: true, congestion: false, zones: true, lanes: true };
   zones = [];                   // {id, cells, ...}
   extra = [];                   // further lines: {points: [[x, y], ...], colour: [r, g, b], width, dash}
   replay = null;                // a moment of the past that is shown instead: {robots: Map}

@@ -41,7 +41,7 @@ export class View {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.readColours());
     this.camera.addEventListener("change", () => this.touch());
     layers.addEventListener("change", () => this.touch("ground", "overlay", "fleet"));
-    fleet.addEventListener("map", () => { this.#fit(); this.touch("cells", "lines"); });
+    fleet.addEventListener("map", () => { this.#fit(); this.touch("cells", "lines", "overlay"); });
     for (const type of ["state", "changes", "selected"]) fleet.addEventListener(type, () => this.touch("lines", "overlay", "fleet"));
     for (const type of ["state", "cells"]) fleet.addEventListener(type, () => this.touch("cells"));
     fleet.addEventListener("changes", () => { if (this.scene.shown.congestion) this.touch("cells"); });

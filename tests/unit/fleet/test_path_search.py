@@ -44,7 +44,7 @@ def expansions(rows: range) -> tuple[int, bool]:
     grid = GridMap(_SIZE, _SIZE)
     goal = 6 * _SIZE + 6
     neighbours = _Neighbours(grid.neighbours)
-    roads = Roads(neighbours, set(), frozenset(), {}, frozenset({goal}))
+    roads = Roads(neighbours, set(), frozenset(), {}, frozenset({goal}), {})
     field = moves_to(goal, grid.neighbours, set(), frozenset())
     found = find_path(roads, busy_ledger(rows), "Robot", goal, field, _EFFORT)
     return neighbours.asked, found is not None

@@ -10,10 +10,11 @@ import pytest
 
 import rce_fleet
 from rce_fleet.coordination.settings import FleetSettings
-from rce_fleet.exceptions import PlannerError
+from rce_fleet.exceptions import LanesError, PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
 from rce_fleet.nodes.grid_parameters import make_grid, unknown_parameters
-from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
+from rce_fleet.nodes.planner_parameters import KNOWN, read_lane_graph, read_settings
+from rce_fleet.planning.grid import GridMap
 
 README = Path(rce_fleet.__file__).parent / "share" / "README.md"
 
@@ -42,6 +43,23 @@ def test_settings_that_cannot_be_used_are_named(values: dict[str, Any], text: st
 def test_unknown_planner_is_refused() -> None:
     with pytest.raises(PlannerError, match=r"parameter planner is 'lacom'; installed planners are .*lacam"):
         read_settings({"planner": "lacom"})
+
+
+def test_lanes_need_the_width_of_the_robots(tmp_path: Path) -> None:
+    file = tmp_path / "lanes.yaml"
+    file.write_text("lanes: [{name: a, path: [0, 2], width: 0.5}, {name: b, path: [8, 9]}]")
+    assert read_lane_graph({}, GridMap(), 0.22) == (None, [])
+    lanes, remarks = read_lane_graph({"lanes": str(file)}, GridMap(), 0.25)
+    assert lanes is not None
+    assert ([lane.name for lane in lanes.lanes], remarks) == (["a", "b"], [])
+    lanes, remarks = read_lane_graph({"lanes": str(file)}, GridMap(), 0.26)
+    assert lanes is not None
+    assert [lane.name for lane in lanes.lanes] == ["b"]
+    text = f"{file}: lane 'a' is 0.5 m wide, and robots with a radius of 0.26 m need 0.52 m: it is not used"
+    assert remarks == [text]
+    file.write_text("lanes: [{name: a, path: [0, 2], width: 0.5}]")
+    with pytest.raises(LanesError, match=re.escape(f"{text}; no lane is left")):
+        read_lane_graph({"lanes": str(file)}, GridMap(), 0.26)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,14 @@ from typing import Any
 import pytest
 from support.fleet_manager import GO, ManagerClient
 
+from rce.ros.types import Time
+from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.mirror import REFUSED_S
+from rce_fleet.nodes.fleet_facts import FactKeeper
+from rce_fleet.nodes.state_publisher import state_fields
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.records import BlockedCells, FleetEntry, PlannerRun, Zone
 
@@ -22,6 +28,29 @@ async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) ->
     assert (await client.ask("PUT", "/cells/5", {"blocked": False}))[0] == 200
     shown = (await client.ask("GET", "/map"))[1]
     assert (shown["blocked"], shown["walls"]) == ([], [9])
+
+
+async def test_the_map_shows_the_lanes(client: ManagerClient) -> None:
+    assert (await client.ask("GET", "/map"))[1]["lanes"] == []
+    client.manager.facts.lanes = LaneGraph((Lane("out", (0, 1), one_way=True, speed=0.5),))
+    lane = {"name": "out", "cells": [0, 1], "one_way": True, "speed": 0.5, "width": 0.0, "cost": 1}
+    assert (await client.ask("GET", "/map"))[1]["lanes"] == [lane]
+
+
+def test_lanes_come_from_the_planners_state() -> None:
+    """Its messages have the fields of a lane; planners of earlier releases tell none."""
+    lanes = LaneGraph(
+        (Lane("out", (0, 1, 2), one_way=True, speed=0.5, cost=3), Lane("b", (2, 10), width=0.5))
+    )
+    planner = FleetPlanner(lanes.restrict(GridMap()), lanes=lanes)
+    state = state_fields(Time(5, 0), planner)
+    facts = FleetFacts()
+    keeper = FactKeeper(facts)
+    keeper.take_state({"sequence": 0, "state": {**state, "started": {"secs": 5, "nsecs": 0}}}, 1.0)
+    assert facts.lanes == lanes
+    del state["lanes"]
+    keeper.take_state({"sequence": 0, "state": {**state, "started": {"secs": 6, "nsecs": 0}}}, 2.0)
+    assert facts.lanes is None
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from rce_fleet.compiled import is_available
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.tasks import travel as travel_module
 from rce_fleet.tasks.records import Zone
 from rce_fleet.tasks.travel import REFRESHED, TravelCosts
@@ -51,6 +52,24 @@ def test_a_robot_may_leave_a_blocked_cell_but_not_enter_it() -> None:
     assert travel.metres(1, 2) == 1.0
     assert travel.metres(2, 1) == float("inf")
     assert travel.metres(0, 2) == float("inf")
+
+
+def test_ways_follow_lanes() -> None:
+    """There along the slow lane, back around; other lanes are another map."""
+    travel, floor = TravelCosts(), GridMap(2, 5, cell_size=0.5)
+    lanes = LaneGraph(
+        (
+            Lane("out", (0, 1, 2, 3, 4), one_way=True, speed=0.25),
+            Lane("back", (4, 9, 8, 7, 6, 5, 0), one_way=True, speed=0.5),
+        )
+    )
+    grid = lanes.restrict(floor)
+    travel.set_map(grid, frozenset(), {}, 0, lanes)
+    assert travel.metres(0, 4) == 4.0
+    assert travel.metres(4, 0) == 3.0
+    assert travel.metres(2, 1) == 2.0 + 3.0 + 1.0
+    travel.set_map(grid, frozenset(), {}, 0)
+    assert travel.metres(2, 1) == 0.5
 
 
 @settings(max_examples=15)

@@ -9,16 +9,16 @@ from rce_fleet.exceptions import PlanningError
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.congestion import Congestion, CongestionSettings
 from rce_fleet.planning.fields import distance_fields
-from rce_fleet.planning.graph import Lane, PlanningGraph
+from rce_fleet.planning.graph import Edge, PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lifelong import LifelongPlanner, LifelongSettings
 
 SIDE, WINDOW = 5, 4
 FLOOR = GridMap(SIDE, SIDE)
-TORUS = PlanningGraph.from_lanes(
+TORUS = PlanningGraph.from_edges(
     SIDE * SIDE,
     [
-        Lane(row * SIDE + column, (row + up) % SIDE * SIDE + (column + right) % SIDE)
+        Edge(row * SIDE + column, (row + up) % SIDE * SIDE + (column + right) % SIDE)
         for row in range(SIDE)
         for column in range(SIDE)
         for up, right in ((0, 1), (1, 0), (0, -1), (-1, 0))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rce_fleet.exceptions import PlanningError
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.execution import execution_times
-from rce_fleet.planning.graph import Lane, PlanningGraph
+from rce_fleet.planning.graph import Edge, PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.guidance import DOWN, LEFT, RIGHT, UP
 from rce_fleet.planning.lacam import LacamPlanner
@@ -184,7 +184,7 @@ def test_motion_follows_from_speed_and_acceleration() -> None:
 
 
 def test_bad_motion_is_refused_with_its_reason() -> None:
-    graph = PlanningGraph.from_lanes(2, [Lane(0, 1)])
+    graph = PlanningGraph.from_edges(2, [Edge(0, 1)])
     with pytest.raises(PlanningError, match="quarter_turn must be a number of steps, 0 or more, not -1"):
         Motion(quarter_turn=-1)
     with pytest.raises(PlanningError, match=r"the heading of robot 1 must be within 0 \.\. 4, not 7"):

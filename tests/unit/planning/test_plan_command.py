@@ -73,6 +73,23 @@ def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path
             at = path.index(goal, at)
 
 
+def test_a_plan_keeps_to_lanes(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """The goal is behind the robot on a one-way ring: it drives all around."""
+    map_, scen = files
+    lanes, output = tmp_path / "lanes.yaml", tmp_path / "plan.json"
+    lanes.write_text("lanes: [{path: [0, 18, 23, 5, 0], one_way: true}]")
+    scen.write_text("version 1\n0\tf\t6\t4\t0\t0\t1\t0\t1\n")
+    code, said = run(map_, "--scen", scen, "--robots", 1, "--lanes", lanes, "--output", output)
+    assert code == 0, said
+    report = json.loads(output.read_text())
+    assert report["paths"][0] == [0, 6, 12, 18, 19, 20, 21, 22, 23, 17, 11, 5, 4, 3, 2, 1]
+    assert report["cost"] == report["lower_bound"] == 15
+    lanes.write_text("lanes: [{path: [0, 7]}]")
+    code, said = run(map_, "--scen", scen, "--robots", 1, "--lanes", lanes, "--output", output)
+    assert code == 1
+    assert f"rce plan: {lanes}: lanes[0].path[1]: cell 7 is neither in the row" in said
+
+
 def test_conflicts_of_shortest_paths_are_told(files: tuple[Path, Path], tmp_path: Path) -> None:
     """Two robots that change places in an aisle: each one's path is right, both together are not."""
     map_, scen = tmp_path / "lane.map", tmp_path / "lane.scen"

@@ -11,7 +11,7 @@ from rce_fleet.exceptions import PlannerError, PlanningError
 from rce_fleet.planning import planner
 from rce_fleet.planning.dijkstra import distances
 from rce_fleet.planning.fields import UNREACHABLE, distance_fields
-from rce_fleet.planning.graph import Lane, PlanningGraph
+from rce_fleet.planning.graph import Edge, PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import JointPlan, PlanningProblem, load_planner, planner_names
@@ -51,8 +51,8 @@ def test_dijkstra_does_not_promise_freedom_of_conflicts() -> None:
     assert joint.cost == 4
 
 
-def test_one_way_lanes_are_driven_in_their_direction() -> None:
-    ring = PlanningGraph.from_lanes(4, [Lane(node, (node + 1) % 4, 3) for node in range(4)])
+def test_one_way_edges_are_driven_in_their_direction() -> None:
+    ring = PlanningGraph.from_edges(4, [Edge(node, (node + 1) % 4, 3) for node in range(4)])
     joint = load_planner("lacam").plan(PlanningProblem.of(ring, [1], [0]))
     assert joint.path(0) == [1, 2, 3, 0]
     assert distance_fields(ring, [0])[0].tolist() == [0, 9, 6, 3]
@@ -124,9 +124,9 @@ def test_a_malformed_problem_says_which_robot(starts: list[int], goals: list[int
         PlanningProblem.of(PlanningGraph.from_grid(GridMap()), starts, goals)
 
 
-def test_a_lane_to_a_missing_node_is_refused() -> None:
+def test_an_edge_to_a_missing_node_is_refused() -> None:
     with pytest.raises(ValueError, match="from 0 to 5"):
-        PlanningGraph.from_lanes(2, [Lane(0, 5)])
+        PlanningGraph.from_edges(2, [Edge(0, 5)])
 
 
 def test_a_plan_counts_steps_to_the_last_arrival() -> None:

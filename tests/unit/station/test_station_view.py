@@ -184,3 +184,13 @@ def test_the_rotation_of_the_grid_is_a_new_map() -> None:
     straight = {"info": {"origin": {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}}}
     assert view.on_grid(straight).is_new_map
     assert not view.on_grid(straight)
+
+
+def test_lanes_are_part_of_the_map() -> None:
+    """Planners of earlier releases tell none."""
+    view, lane = FleetView(), {"name": "out", "cells": [0, 1], "one_way": True}
+    view.on_state(state())
+    assert (view.map() or {})["lanes"] == []
+    assert view.on_state(state(lanes=[lane])).is_new_map
+    assert (view.map() or {})["lanes"] == [lane]
+    assert not view.on_state(state(lanes=[lane]))
