@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from random import Random
 from resource import RUSAGE_SELF, getrusage
 from time import thread_time
-from typing import Any, assert_never
+from typing import Any, Self, assert_never
 
 import numpy as np
 
@@ -109,11 +109,17 @@ class Fleet:
     goals: dict[str, int] = field(default_factory=dict)
 
     @classmethod
-    def make(cls, count: int) -> Fleet:
-        """Return a fleet at rest."""
-        world = warehouse()
-        planner = FleetPlanner(world.grid, FleetSettings(robot_radius=ROBOT_RADIUS))
-        fleet = cls(world, make_robots(world, count), planner, Random(1))
+    def make(
+        cls,
+        count: int,
+        world: NamedWorld | None = None,
+        settings: FleetSettings | None = None,
+        seed: int = 1,
+    ) -> Self:
+        """Return a fleet at rest; by default in the demo's warehouse."""
+        world = world or warehouse()
+        planner = FleetPlanner(world.grid, settings or FleetSettings(robot_radius=ROBOT_RADIUS))
+        fleet = cls(world, make_robots(world, count), planner, Random(seed))
         fleet.clients = [MoveClient(world.grid, name, 0.0, ClientReport(0)) for name in fleet.robots.names]
         return fleet
 
@@ -137,10 +143,14 @@ class Fleet:
         self.tell(Tick())
         if self.requests:
             began = thread_time()
-            result = compute_plan(self.requests.pop())
+            result = compute_plan(self.limited(self.requests.pop()))
             self.plans += thread_time() - began
             self.requests.clear()
             self.tell(PlanMade(result))
+
+    def limited(self, request: PlanRequest) -> PlanRequest:
+        """Return a request as the process that makes plans gets it."""
+        return request
 
     def tell(self, event: Event) -> None:
         """Give an event to the planner."""

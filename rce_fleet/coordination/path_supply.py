@@ -6,6 +6,7 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.events import Instruction, MakePlan
+from rce_fleet.coordination.improving import Improving
 from rce_fleet.coordination.repair import PathRepair
 from rce_fleet.coordination.replanning import PlanAdoption, PlanRequest, PlanResult, request_plan
 from rce_fleet.coordination.rerouting import adopt_rerouting
@@ -48,6 +49,7 @@ class PathSupply:
         self._partial = False
         self._repair = PathRepair(state)
         self._guard = StarvationGuard(state, settings)
+        self._improving = Improving(state, settings)
         self._is_alone = settings.planner == INDEPENDENT
         state.ledger.ordered = not self._is_alone
         self._looked_at = -inf
@@ -87,7 +89,10 @@ class PathSupply:
             return
         if result.rerouting is not None:
             self._asked = None
-            if result.rerouting.found:
+            if request.improve_seconds:
+                self._improving.take(request, result.rerouting)
+            elif result.rerouting.found:
+                self._improving.is_due = True
                 self.concerned |= adopt_rerouting(self._state, request, result.rerouting, self._versions)
             else:
                 self.outdated = True
@@ -110,6 +115,7 @@ class PathSupply:
         if adoption is None or not adoption.step(self._settings.visits_per_step):
             return False
         self.outdated |= adoption.was_cut
+        self._improving.is_due = True
         self._asked = self._adoption = None
         return self.outdated and not self._awaited(now)
 
@@ -133,10 +139,22 @@ class PathSupply:
             self.outdated |= need.plan
         if self.concerned and is_tick and not self.outdated:
             request = self._replan_concerned(now)
+            self._improving.is_due = True
             self._state.refresh()
             if request is not None:
                 return request
-        return self._ask(now) if self.outdated and not self._awaited(now) else None
+        if self.outdated:
+            return None if self._awaited(now) else self._ask(now)
+        if is_tick and not self.concerned and self._improving.may_begin(now):
+            return self._ask_for_better(now)
+        return None
+
+    def _ask_for_better(self, now: float) -> MakePlan:
+        """Return a request to improve the paths that robots have."""
+        self._asked = request_plan(self._state, self._settings, self._plans, now, improve=True)
+        self._improving.begin(self._asked, now)
+        self._plans += 1
+        return MakePlan(self._asked)
 
     def _ask(self, now: float) -> MakePlan:
         self.concerned.clear()

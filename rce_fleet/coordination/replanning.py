@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.coordination.improving import compute_improvement
 from rce_fleet.coordination.rerouting import (
     NO_CELL,
     LedgerCopy,
@@ -67,6 +68,8 @@ class PlanRequest:
         stop: Time lost by stopping and starting, in steps; 0: not counted.
         urgency: How urgent each robot is, see :mod:`rce_fleet.coordination.starvation`.
         copy: Where only some robots need new paths: the paths of all; None: one plan is made for all.
+        improve_seconds: Time in which better paths are looked for among those of the copy, none of which has
+            to change; 0: the copy's members need new paths.
     """
 
     number: int
@@ -90,6 +93,7 @@ class PlanRequest:
     stop: float = 0.0
     urgency: tuple[int, ...] = ()
     copy: LedgerCopy | None = None
+    improve_seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +108,7 @@ class PlanResult:
         complete: Whether the plan ends with all robots at their targets.
         steps: Step of each visit, from 1 on.
         ordered: Whether robots that keep the plan's order never wait for each other in a circle.
-        rerouting: The new paths, where only some robots need one; then there are no visits.
+        rerouting: The new paths, where only some robots get new or better ones; then there are no visits.
         failure: The error with which the planner ended, as type and text; then there are no visits.
     """
 
@@ -120,7 +124,13 @@ class PlanResult:
 
 
 def request_plan(
-    state: FleetState, settings: FleetSettings, number: int, now: float, members: Sequence[str] = ()
+    state: FleetState,
+    settings: FleetSettings,
+    number: int,
+    now: float,
+    members: Sequence[str] = (),
+    *,
+    improve: bool = False,
 ) -> PlanRequest:
     """Return the input of a plan from the fleet's state.
 
@@ -133,7 +143,9 @@ def request_plan(
         number: Number of the plan; changes how ties are broken.
         now: Time, seconds.
         members: Robots that need new paths, the first ones first; none: one plan is made for all.
+        improve: Look for better paths instead; no robot needs a new one.
     """
+    for_all = not members and not improve
     robots, starts, goals, rests = [], [], [], []
     blocked = set(state.shut)
     for record in state.robots.values():
@@ -164,7 +176,7 @@ def request_plan(
         move_costs=tuple((start, end, cost) for (start, end), cost in state.zones.move_costs.items()),
         own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
-        headings=() if members else tuple(_heading(state, robot) for robot in robots),
+        headings=tuple(_heading(state, robot) for robot in robots) if for_all else (),
         quarter_turn=settings.quarter_turn,
         stop=settings.stop,
         urgency=(
@@ -172,7 +184,8 @@ def request_plan(
             if members
             else tuple(urgency_of(state, state.robots[robot], settings, now) for robot in robots)
         ),
-        copy=copy_ledger(state, robots, members) if members else None,
+        copy=None if for_all else copy_ledger(state, robots, members),
+        improve_seconds=settings.improve_seconds if improve else 0.0,
     )
 
 
@@ -224,7 +237,7 @@ def _forbidden(state: FleetState, robots: list[str]) -> Iterator[tuple[int, tupl
 
 
 def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanResult:
-    """Return the plan. The same request to a new planner always gives the same plan.
+    """Return the plan. The same request to a new planner gives the same plan, unless its time is over first.
 
     Args:
         request: What to plan.
@@ -234,7 +247,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         PlannerError: There is no planner of this name.
     """
     if request.copy is not None:
-        rerouting = compute_rerouting(request)
+        rerouting = compute_improvement(request) if request.improve_seconds else compute_rerouting(request)
         return PlanResult(request.number, (), (), (), complete=True, rerouting=rerouting)
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
     forbidden = {index: frozenset(cells) for index, cells in request.forbidden}

@@ -121,17 +121,7 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
     graph, own_costs = weighted_graph(request, grid)
     found = reroute(
         graph,
-        RoutedRobots(
-            starts=np.array(request.starts, np.int32),
-            begins=_floats(copy.begins),
-            goals=np.array(request.goals, np.int32),
-            rests=np.array(request.rests, np.int32),
-            lengths=_ints(copy.lengths),
-            nodes=_ints(copy.cells),
-            steps=_floats(copy.steps),
-            fixed=(_ints(copy.granted), _floats(copy.leaves)),
-            clock=copy.clock,
-        ),
+        copied_robots(request, copy),
         copy.members,
         effort=min(request.effort, _MOST_EFFORT),
         seed=request.seed,
@@ -143,9 +133,31 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
     return Rerouting(
         True,
         tuple(found.paths),
-        tuple(tuple(zip(cells.tolist(), at.tolist(), strict=True)) for cells, at in found.paths.values()),
+        paths_as_tuples(found.paths),
         found.unreachable,
     )
+
+
+def copied_robots(request: PlanRequest, copy: LedgerCopy) -> RoutedRobots:
+    """Return the robots of a request with the paths that its copy of the ledger holds."""
+    return RoutedRobots(
+        starts=np.array(request.starts, np.int32),
+        begins=_floats(copy.begins),
+        goals=np.array(request.goals, np.int32),
+        rests=np.array(request.rests, np.int32),
+        lengths=_ints(copy.lengths),
+        nodes=_ints(copy.cells),
+        steps=_floats(copy.steps),
+        fixed=(_ints(copy.granted), _floats(copy.leaves)),
+        clock=copy.clock,
+    )
+
+
+def paths_as_tuples(
+    paths: Mapping[int, tuple[NDArray[np.int32], NDArray[np.float64]]],
+) -> tuple[tuple[tuple[int, float], ...], ...]:
+    """Return cells and steps of each path, in the order of the robots."""
+    return tuple(tuple(zip(cells.tolist(), at.tolist(), strict=True)) for cells, at in paths.values())
 
 
 def weighted_graph(

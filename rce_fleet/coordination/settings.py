@@ -43,6 +43,8 @@ class FleetSettings:
         quarter_turn: Time in which a robot turns by 90 degrees, over the time in which it drives through a
             cell; ``lacam`` plans for the time of turning. 0: not counted.
         stop: Time that a robot loses by stopping and starting, likewise.
+        improve_seconds: Time in which the planner's process looks for better paths after paths have changed,
+            see :mod:`rce_fleet.coordination.improving`; with ``lacam`` only. 0: never.
         repairs: At most so many robots get new paths at once, between the others'; if more need one, or
             there is none, the planner's process looks for them, see
             :mod:`rce_fleet.coordination.rerouting`. 0: one plan is always made for all.
@@ -82,6 +84,7 @@ class FleetSettings:
     resolve_deadlocks: bool = False
     quarter_turn: float = 0.0
     stop: float = 0.0
+    improve_seconds: float = 0.0
     repairs: int = 3
     repair_effort: int = 12_000
     manual_clearance: float = 0.3

@@ -39,6 +39,7 @@ from rce_fleet.coordination.rerouting import Rerouting
 from rce_fleet.coordination.settings import COMPILED_EFFORT, PLAN_TIMEOUT
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
+from rce_fleet.planning.path_improvement import PATH_IMPROVEMENT_KERNELS
 from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
 from rce_fleet.planning.rerouting import REROUTING_KERNELS
 
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     import logging
     from types import TracebackType
 
+DRIVING_KERNELS = (*REROUTING_KERNELS, *PATH_IMPROVEMENT_KERNELS)
+"""Loops for robots that drive, beside those of the default planner."""
 _LENGTH = 4
 """Bytes of the length in front of each message."""
 _ENDING_S = 5.0
@@ -305,6 +308,10 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
         if compiled:  # compiled loops do so much more in the same time
             request = replace(request, effort=max(request.effort, COMPILED_EFFORT))
         try:
+            if request.improve_seconds and not compiled:  # too slow to find anything in the time
+                results.write(_frame(msgspec.msgpack.encode(nothing_better(request))))
+                results.flush()
+                continue
             if request.planner not in planners:
                 planners[request.planner] = load_planner(request.planner)
             result = compute_plan(request, planners[request.planner])
@@ -314,6 +321,11 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
             result = failed_plan(request, f"{type(error).__name__}: {error}")
         results.write(_frame(msgspec.msgpack.encode(result)))
         results.flush()
+
+
+def nothing_better(request: PlanRequest) -> PlanResult:
+    """Return the answer to a request for better paths where all robots keep theirs."""
+    return PlanResult(request.number, (), (), (), complete=True, rerouting=Rerouting(found=True))
 
 
 def failed_plan(request: PlanRequest, failure: str) -> PlanResult:
@@ -326,12 +338,12 @@ def load_cached() -> bool:
     """Use compiled loops if the cache has all that plans need; return whether it has."""
     from rce_fleet.planning.lacam import KERNELS
 
-    return load_kernels((*KERNELS, *REROUTING_KERNELS))
+    return load_kernels((*KERNELS, *DRIVING_KERNELS))
 
 
 def load_compiled() -> Planner:
     """Compile the loops, and return the default planner."""
-    compile_kernels(REROUTING_KERNELS)
+    compile_kernels(DRIVING_KERNELS)
     return load_planner(DEFAULT_PLANNER)
 
 

@@ -23,9 +23,12 @@ KNOWN = GRID_PARAMETERS | frozenset(
     {
         *("blocked", "lanes", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
+        "improve_seconds",
     }
 )
 """Names of all parameters."""
+IMPROVE_SECONDS = 0.05
+"""How long better paths are looked for. Nothing is granted meanwhile: less than a tick's time."""
 
 
 def read_settings(values: Mapping[str, Any]) -> FleetSettings:
@@ -47,10 +50,13 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
         quarter_turn=read_number(values, "quarter_turn", 0.0),
         stop=read_number(values, "stop", 0.0),
+        improve_seconds=read_number(values, "improve_seconds", IMPROVE_SECONDS),
     )
     for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw", "plan_timeout"):
         if getattr(settings, name) <= 0:
             raise ValueError(f"the parameter {name} must be above 0, not {getattr(settings, name):g}")
+    if settings.improve_seconds < 0:
+        raise ValueError(f"the parameter improve_seconds must be 0 or more, not {settings.improve_seconds:g}")
     Motion(settings.quarter_turn, settings.stop)  # an impossible value has its reason
     if settings.planner not in planner_names():
         known = ", ".join(planner_names())

@@ -16,6 +16,7 @@ MODULES = (
     (
         "rce_fleet.planning.lacam",
         "rce_fleet.planning.lifelong",
+        "rce_fleet.planning.path_improvement_loops",
         "rce_fleet.planning.rerouting_loops",
         "rce_fleet.planning.visit_lists",
     ),

@@ -96,14 +96,12 @@ def reroute(
         The new paths; None if not all of them were found.
     """
     size, count = len(graph), len(robots.starts)
-    routes_at = np.concatenate(([0], np.cumsum(robots.lengths))).astype(np.int32)
+    routes_at = routes_begin(robots.lengths)
     counts, times, tags = list_visits(
         size, robots.starts, robots.goals, routes_at, robots.nodes, robots.steps, robots.fixed
     )
-    closed_of = [sorted((forbidden or {}).get(robot, ())) for robot in range(count)] if forbidden else []
-    closed_at = np.zeros(count + 1, np.int32)
-    closed_at[1:] = np.cumsum([len(closed) for closed in closed_of]) if closed_of else 0
-    costs_at, costs = _cost_rows(graph, count, own_costs or {})
+    closed_at, closed = closed_rows(forbidden, count)
+    costs_at, costs = cost_rows(graph, count, own_costs or {})
     touched = len(members) + TOUCHED
     slots, lengths = np.full(count, -1, np.int32), np.full(touched, PLANNED, np.int32)
     nodes, steps = np.empty((touched, LONGEST), np.int32), np.empty((touched, LONGEST))
@@ -111,8 +109,7 @@ def reroute(
     targets = np.where(robots.goals >= 0, robots.goals, np.where(is_free, robots.rests, -1)).astype(np.int32)
     done = reroute_robots(
         graph.indptr, graph.neighbours, costs_at, costs, graph.reverse.indptr, graph.reverse.neighbours,
-        robots.starts, robots.begins, robots.goals, targets, closed_at,
-        np.array([node for closed in closed_of for node in closed], np.int32),
+        robots.starts, robots.begins, robots.goals, targets, closed_at, closed,
         routes_at, robots.nodes, robots.steps, robots.clock, effort, np.array(members, np.int32),
         counts, times, tags, slots, lengths, nodes, steps, np.array([seed + 1], np.int64),
     )  # fmt: skip
@@ -127,7 +124,20 @@ def reroute(
     return Rerouted(paths, unreachable)
 
 
-def _cost_rows(graph: PlanningGraph, count: int, own_costs: Mapping[int, Ints]) -> tuple[Ints, Ints]:
+def routes_begin(lengths: Ints) -> Ints:
+    """Return where each robot's path begins in arrays of all paths, shape (robots + 1,)."""
+    return np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
+
+
+def closed_rows(forbidden: Mapping[int, frozenset[int]] | None, count: int) -> tuple[Ints, Ints]:
+    """Return where the forbidden nodes of each robot begin, shape (robots + 1,), and these nodes."""
+    closed_of = [sorted((forbidden or {}).get(robot, ())) for robot in range(count)] if forbidden else []
+    closed_at = np.zeros(count + 1, np.int32)
+    closed_at[1:] = np.cumsum([len(closed) for closed in closed_of]) if closed_of else 0
+    return closed_at, np.array([node for closed in closed_of for node in closed], np.int32)
+
+
+def cost_rows(graph: PlanningGraph, count: int, own_costs: Mapping[int, Ints]) -> tuple[Ints, Ints]:
     """Return the row of costs of each robot, shape (robots,), and these rows, shape (rows, edges)."""
     rows, row_of = [graph.costs], {id(graph.costs): 0}
     costs_at = np.zeros(count, np.int32)

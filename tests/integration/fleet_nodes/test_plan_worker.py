@@ -8,13 +8,15 @@ import logging
 import os
 import signal
 import sys
+from array import array
 from dataclasses import replace
 
 import psutil
 import pytest
 
+from rce_fleet.coordination.ledger_view import CELLS, STEPS
 from rce_fleet.coordination.replanning import PlanRequest, compute_plan
-from rce_fleet.coordination.rerouting import NO_CELL
+from rce_fleet.coordination.rerouting import NO_CELL, LedgerCopy
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.plan_worker import PlanWorker, is_large
 
@@ -41,7 +43,7 @@ COMPILES_NOTHING = """
 import sys
 from rce_fleet.nodes import plan_worker
 from rce_fleet.planning import lacam
-lacam.KERNELS = plan_worker.REROUTING_KERNELS = ()
+lacam.KERNELS = plan_worker.DRIVING_KERNELS = ()
 if "--cached" in sys.argv and not IS_CACHED:
     sys.exit()
 plan_worker.main()
@@ -191,6 +193,40 @@ async def test_a_process_with_compiled_loops_takes_over(monkeypatch: pytest.Monk
         assert len(children) == 1
         os.kill(children[0].pid, signal.SIGKILL)
         assert await worker.compute(request_of(4)) == compute_plan(request_of(4))
+
+
+def late_request(number: int) -> PlanRequest:
+    """One robot waits 20 steps in an empty floor; better paths are asked for."""
+    path = array(CELLS, range(1, 8)), array(STEPS, (20.0 + cell for cell in range(1, 8)))
+    copy = LedgerCopy(
+        members=(),
+        begins=array(STEPS, (0.0,)).tobytes(),
+        lengths=array(CELLS, (7,)).tobytes(),
+        cells=path[0].tobytes(),
+        steps=path[1].tobytes(),
+        granted=b"",
+        leaves=b"",
+        clock=0.0,
+    )
+    request = replace(request_of(number, robots=1), goals=(7,), blocked=(), copy=copy)
+    return replace(request, improve_seconds=60.0)
+
+
+async def test_better_paths_are_found_where_loops_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without them the answer is at once that robots keep their paths."""
+    pytest.importorskip("numba")
+    monkeypatch.delenv("RCE_COMPILED", raising=False)
+    monkeypatch.setattr("rce_fleet.nodes.plan_worker._LOAD_S", 600.0)
+    async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", FULL_CACHE)) as worker:
+        plain = (await worker.compute(late_request(1))).rerouting
+        assert plain is not None
+        assert plain.found
+        assert plain.robots == ()
+        await worker.compute(LARGE)
+        assert worker.is_compiled
+        better = (await worker.compute(late_request(2))).rerouting
+    assert better is not None
+    assert better.paths == (tuple((cell, float(cell)) for cell in range(1, 8)),)
 
 
 async def test_plans_are_made_if_nothing_can_be_compiled(caplog: pytest.LogCaptureFixture) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,16 @@ from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import LanesError, PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
 from rce_fleet.nodes.grid_parameters import make_grid, unknown_parameters
-from rce_fleet.nodes.planner_parameters import KNOWN, read_lane_graph, read_settings
+from rce_fleet.nodes.planner_parameters import IMPROVE_SECONDS, KNOWN, read_lane_graph, read_settings
 from rce_fleet.planning.grid import GridMap
 
 README = Path(rce_fleet.__file__).parent / "share" / "README.md"
 
 
 def test_defaults_are_the_settings() -> None:
-    assert read_settings({}) == FleetSettings()
-    assert read_settings({"robot_radius": 1, "seed": 3.0}) == FleetSettings(robot_radius=1.0, seed=3)
+    default = FleetSettings(improve_seconds=IMPROVE_SECONDS)
+    assert read_settings({}) == default
+    assert read_settings({"robot_radius": 1, "seed": 3.0}) == replace(default, robot_radius=1.0, seed=3)
 
 
 @pytest.mark.parametrize(
@@ -33,6 +35,7 @@ def test_defaults_are_the_settings() -> None:
         ({"seed": 0.5}, "parameter seed must be a whole number, not 0.5"),
         ({"seed": True}, "parameter seed must be a number, not True"),
         ({"quarter_turn": -1}, "-1"),
+        ({"improve_seconds": -1}, "parameter improve_seconds must be 0 or more, not -1"),
     ],
 )
 def test_settings_that_cannot_be_used_are_named(values: dict[str, Any], text: str) -> None:

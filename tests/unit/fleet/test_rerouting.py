@@ -73,6 +73,34 @@ def drive(starts: list[int], routes: list[Route], seed: int) -> CellLedger:
     return ledger
 
 
+def last_waited_for(ledger: CellLedger, count: int) -> list[str]:
+    """Return for each robot that waits the last one of those that it waits for, one after another.
+
+    Raises:
+        AssertionError: Robots wait for each other in a circle.
+    """
+    waits_for = {}
+    for robot in range(count):
+        route = ledger.route(name(robot))
+        if len(route) > 1:
+            ahead = min(
+                (step, other)
+                for other in map(name, range(count))
+                for cell, step in ledger.horizon(other)
+                if cell == route[1]
+            )
+            waits_for[name(robot)] = ahead[1]
+    ends = []
+    for first in waits_for:
+        last, seen = first, set()
+        while last in waits_for:
+            assert last not in seen, f"{last} waits for itself"
+            seen.add(last)
+            last = waits_for[last]
+        ends.append(last)
+    return ends
+
+
 def find(seed: int) -> tuple[GridMap, list[int], list[int], list[Route], int, Rerouted | None]:
     """Block a cell on robots' paths; return the map, starts, goals, paths, the cell and the new paths."""
     grid, starts, goals, routes = planned(seed)
@@ -99,23 +127,7 @@ def test_robots_with_new_paths_wait_in_no_circle(seed: int) -> None:
         assert grid.blocked.union([blocked]).isdisjoint(cells.tolist())
         assert robot in found.unreachable or [starts[robot], *cells.tolist()][-1] == goals[robot]
     ledger = drive(starts, routes, seed)
-    waits_for = {}
-    for robot in range(len(starts)):
-        route = ledger.route(name(robot))
-        if len(route) > 1:
-            ahead = min(
-                (step, other)
-                for other in map(name, range(len(starts)))
-                for cell, step in ledger.horizon(other)
-                if cell == route[1]
-            )
-            waits_for[name(robot)] = ahead[1]
-    for robot_id in waits_for:
-        first, seen = robot_id, set()
-        while first in waits_for:
-            assert first not in seen, f"{first} waits for itself"
-            seen.add(first)
-            first = waits_for[first]
+    for first in last_waited_for(ledger, len(starts)):
         index = int(first.removeprefix("Robot"))
         assert ledger.route(first) == [goals[index]] or index in found.unreachable
 
