@@ -21,7 +21,7 @@ from rce_fleet.drivers.report import read_report
 from rce_fleet.exceptions import StationUnavailableError
 from rce_fleet.station.client import StationClient
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk")]
 
 TIMEOUT_S = 280.0
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]

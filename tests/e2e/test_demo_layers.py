@@ -12,7 +12,7 @@ from support.ports import free_port
 
 from rce_fleet.station.layers.kinds import LAYERS
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk"), pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk"), pytest.mark.timeout(400)]
 
 WAIT_S = 240.0
 WITHOUT_GOAL = set(LAYERS) - {"plan"}
@@ -42,7 +42,9 @@ async def layers_of(page: str, robot: str, wanted: set[str]) -> dict[str, str]:
     return missing
 
 
-@pytest.mark.parametrize("options", [("--mode", "multi"), ("--offload",)], ids=["multi", "offload"])
+@pytest.mark.parametrize(
+    "options", [("--mode", "multi", "--machines", "ports"), ("--offload",)], ids=["multi", "offload"]
+)
 async def test_all_layers_of_a_standing_robot_are_shown(options: tuple[str, ...]) -> None:
     more = ("--core-port", free_port()) if "multi" in options else ()
     async with running_demo(*options, *more, "--robots", 2, "--no-auto") as demo:

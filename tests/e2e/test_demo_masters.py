@@ -17,7 +17,12 @@ from support.ports import free_row
 
 from rce_fleet.drivers.report import read_report
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd", "pymunk"), pytest.mark.timeout(900)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.real_time,
+    pytest.mark.needs("etcd", "pymunk"),
+    pytest.mark.timeout(900),
+]
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"

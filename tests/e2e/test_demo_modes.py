@@ -22,7 +22,7 @@ from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.exceptions import StationError
 from rce_fleet.station.client import StationClient
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk")]
 
 ROBOTS, SEED = 2, 17
 """Its ways are short."""
@@ -61,17 +61,12 @@ async def test_single_with_a_real_roscore() -> None:
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode="single", robots=1, seed=21)
 
 
-async def test_the_page_of_a_single_core_and_its_end() -> None:
-    options = ("--mode", "single", "--robots", 1, "--core-port", free_port(), "--no-auto")
+async def test_one_core_carries_all_and_killed_programs_come_back() -> None:
+    """They do until the demo itself is killed, which leaves no program."""
+    options = ("--mode", "single", "--robots", 2, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
-
         await until(lambda: _is(_state(station), "idle"), timeout=WAIT_S, what="the robot is in its place")
-        (robot,) = (await station.fleet()).robots
-        assert robot.pose is not None
-        assert robot.cell is not None
-        await station.set_goal(robot.id, robot.cell)
-        await until(lambda: _is(_state(station), "arrived"), timeout=WAIT_S, what="it has its goal")
         news: dict[str, dict[str, Any]] = {}
         async with session.ws_connect(f"{demo.page}api/v1/live") as live, asyncio.timeout(WAIT_S):
             while not {"engine", "state", "map", "poses"} <= news.keys():
@@ -79,11 +74,13 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
                 news[message["type"]] = message
         names = {node["name"] for node in news["engine"]["graph"]["nodes"]}
         assert {"/fleet_planner", "/Robot1/robot", "/Robot1/move_client", "/world"} <= names
-        assert news["state"]["robots"][0]["state"] == "arrived"
+        assert news["state"]["robots"][0]["state"] == "idle"
+        await _check_restarts(demo, station)
+        await check_killed_demo(demo, set())
 
 
 async def test_machines_share_only_the_synced_topics() -> None:
-    """They do until the demo is killed, which leaves nothing of them."""
+    """Killed programs come back, until the demo itself is killed, which leaves nothing of them."""
     before = set(psutil.net_if_addrs())
     async with (
         running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo,
@@ -126,40 +123,31 @@ async def test_machines_share_only_the_synced_topics() -> None:
         await until(lambda: _is(_state(station), "idle"), timeout=WAIT_S, what="lists are answered")
         for machine, topics in shared.items():
             assert await foreign(machine) == topics
+        await _check_restarts(demo, station)
         await check_killed_demo(demo, cables)
 
 
-@pytest.mark.parametrize("mode", ["single", "multi"])
-async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
-    """They do until the demo itself is killed, which leaves no program."""
-    options = ("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
-    async with running_demo(*options, "--machines", "ports") as demo, aiohttp.ClientSession() as session:
-        station = StationClient(session, demo.page)
-        await until(lambda: _is(_state(station), "idle"), timeout=WAIT_S, what="the robot is in its place")
-        fleet = await station.fleet()
-        assert fleet.map is not None
-        taken = {robot.cell for robot in fleet.robots} | set(fleet.blocked)
-        columns, here = fleet.map.columns, fleet.robots[0].cell
-        assert here is not None
+async def _check_restarts(demo: Demo, station: StationClient) -> None:
+    """Kill the planner, then a robot's move client, each before the robot drives to a cell near it."""
+    fleet = await station.fleet()
+    assert fleet.map is not None
+    taken = {robot.cell for robot in fleet.robots} | set(fleet.blocked)
+    columns, here = fleet.map.columns, fleet.robots[0].cell
+    assert here is not None
 
-        def distance(cell: int) -> int:
-            return abs(cell // columns - here // columns) + abs(cell % columns - here % columns)
+    def distance(cell: int) -> int:
+        return abs(cell // columns - here // columns) + abs(cell % columns - here % columns)
 
-        free = [cell for cell in range(fleet.map.rows * columns) if cell not in taken]
-        cells = sorted(free, key=distance)[1:3]
-        for words, cell in (
-            (("fleet_planner.py",), cells[0]),
-            (("move_client.py", "__ns:=Robot1"), cells[-1]),
-        ):
-            await _send(station, "Robot1", cell)
-            kill_program(demo.process.pid, *words)
-            await until(
-                partial(_arrives, station, "Robot1", cell),
-                timeout=180,
-                what=f"Robot1 is at cell {cell}",
-            )
-        assert demo.output().count("restarting it") == 2
-        await check_killed_demo(demo, set())
+    free = [cell for cell in range(fleet.map.rows * columns) if cell not in taken]
+    cells = sorted(free, key=distance)[1:3]
+    for words, cell in (
+        (("fleet_planner.py",), cells[0]),
+        (("move_client.py", "__ns:=Robot1"), cells[-1]),
+    ):
+        await _send(station, "Robot1", cell)
+        kill_program(demo.process.pid, *words)
+        await until(partial(_arrives, station, "Robot1", cell), timeout=180, what=f"Robot1 is at cell {cell}")
+    assert demo.output().count("restarting it") == 2
 
 
 async def _send(station: StationClient, robot: str, cell: int) -> None:

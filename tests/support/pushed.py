@@ -39,9 +39,15 @@ class Pushed:
         return master.log.parent / master.name / "bundles" / self.sha256
 
     def holders(self, made: Masters) -> list[MasterProcess]:
-        found = [master for master in made.all if self.path(master).exists()]
-        assert all(self.path(master).read_bytes() == self.archive for master in found)
-        return found
+        return [master for master in made.all if self._is_at(master)]
+
+    def _is_at(self, master: MasterProcess) -> bool:
+        try:
+            archive = self.path(master).read_bytes()
+        except FileNotFoundError:
+            return False
+        assert archive == self.archive
+        return True
 
     async def until_held(self, made: Masters, count: int) -> None:
         await until(lambda: len(self.holders(made)) == count, timeout=WAIT_S, what=f"{count} have it")
