@@ -23,8 +23,9 @@ class ControlTimeouts:
     ping_timeout: float = 5.0
     """A peer that does not answer a ping for so long is gone."""
     close: float = 1.0
-    request: float = 10.0
-    """An answer of the master; long enough for a master that is being restarted."""
+    request: float = 15.0
+    """An answer of the master; long enough for a master that is being restarted, and for another one to lead
+    after a machine was lost."""
     busy: float = 60.0
     """An answer of a master that is connected all the time, but has much to do."""
     log: float = 5.0
