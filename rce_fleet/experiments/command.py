@@ -26,7 +26,7 @@ MAKE_PAGE = "page"
 """Name by which only the page is made."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
-QUICK_SECONDS = 1.0
+QUICK_SECONDS = 2.0
 QUICK_ROBOTS = 2
 """More robots show nothing that two do not."""
 
