@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 from rce.aio.tasks import cancel_and_wait
 from rce_fleet.api.tasks import StopModel, TaskRequest
 from rce_fleet.client import ApiError, FleetApiUnavailableError, FleetClient
+from rce_fleet.tasks.tables import WITH_ROBOT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -38,7 +39,8 @@ COMPARE_S = 20.0
 """Seconds after which the manager is asked for its open tasks, in case events were missed."""
 SETTLE_S = 60.0
 """How long the manager is asked at the end, if it does not answer."""
-WORKING = frozenset({"running", "cancelling"})
+WORKING = frozenset(state.value for state in WITH_ROBOT)
+"""States in which a robot has something to do, also if it cannot continue now."""
 ENDED = frozenset({"done", "failed", "cancelled"})
 
 
