@@ -1,7 +1,7 @@
 """Measure what settings of the planner are worth: ``python -m benchmarks.throughput [--quick] [--robots N]``.
 
-It needs no engine. Light robots, which turn and accelerate, drive on aisles-33-46 from goal to goal. The
-table has the goals that they reach with each choice of settings. Plans take no time of the world, and effort ends
+It needs no engine. Light robots, which turn and accelerate, drive on aisles-33-46 from goal to goal. A table
+has the goals that they reach with each choice of settings. Plans take no time of the world, and effort ends
 the search for better paths, so the same seed gives the same run.
 
 The map is that of the benchmarks, in the folder ``RCE_DATA``.
