@@ -141,8 +141,9 @@ async def test_a_planner_that_raises_gives_an_empty_plan(caplog: pytest.LogCaptu
     assert "restarting" not in caplog.text
 
 
-async def test_a_worker_ends_with_its_input() -> None:
-    """Also when the planner is killed and cannot end it."""
+async def test_a_worker_ends_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when the planner is killed and cannot end it; without loops, which it would load first."""
+    monkeypatch.setenv("RCE_COMPILED", "no")
     command = (sys.executable, "-P", "-m", "rce_fleet.nodes.plan_worker")
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe)
