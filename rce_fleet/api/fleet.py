@@ -139,7 +139,7 @@ class ZoneRequest(ApiModel):
     )
     edges: list[Annotated[list[Cell], Field(min_length=2, max_length=2)]] = Field(
         default_factory=list,
-        description="Of a blocked zone: moves [from, to] that no robot makes.",
+        description="Of a blocked zone: moves [from, to] that robots do not make.",
         max_length=100000,
     )
     robots: list[str] = Field(

@@ -159,10 +159,13 @@ class CellBlocking:
             if record.phase is not Phase.ACTIVE or len(route) < 2:  # noqa: PLR2004 - a path has two cells
                 continue
             forbidden = state.forbidden(record.id, lambda zone: users[zone.id])
+            own_closed = state.zones.closed_for(record.id, state.grid)
             wrong = [
                 index
                 for index, (before, cell) in enumerate(pairwise(route), start=1)
-                if (before, cell) in closed or (cell in forbidden and before not in forbidden)
+                if (before, cell) in closed
+                or (before, cell) in own_closed
+                or (cell in forbidden and before not in forbidden)
             ]
             if not wrong:
                 continue

@@ -81,6 +81,11 @@ class FleetState:
         zones = self.zones
         return union_of([zones.forbidden(robot), zones.full(robot, users or self.zone_users)])
 
+    def closed(self, robot: str) -> frozenset[tuple[int, int]]:
+        """Return the moves ``(from, to)`` that a robot may not make."""
+        common, own = self.zones.closed(self.grid), self.zones.closed_for(robot, self.grid)
+        return common | own if own else common
+
     def zone_users(self, zone: Zone) -> set[str]:
         """Return the robots that claim a cell of a zone or have a path into it."""
         found: set[str] = set()

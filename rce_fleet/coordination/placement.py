@@ -235,7 +235,7 @@ class Placement:
     def _exits(self, record: RobotRecord, cell: int) -> list[int]:
         """Return the cells beside one that a robot may enter, the nearest first."""
         state = self._state
-        closed, forbidden = state.zones.closed(state.grid), state.forbidden(record.id)
+        closed, forbidden = state.closed(record.id), state.forbidden(record.id)
         exits = [
             other
             for other in state.grid.around(cell)

@@ -27,7 +27,7 @@ class PathRepair:
     def __init__(self, state: FleetState) -> None:
         self._state = state
         self._version = -1
-        self._fields: dict[tuple[int, frozenset[int]], list[int]] = {}
+        self._fields: dict[tuple[int, frozenset[int], frozenset[tuple[int, int]]], list[int]] = {}
 
     def replan(self, record: RobotRecord, effort: int) -> bool:
         """Give an active robot a new route beyond its granted cells; its old one may be its beginning.
@@ -47,7 +47,7 @@ class PathRepair:
         assert start is not None
         forbidden = state.forbidden(robot)
         goal = record.goal
-        is_unreachable = goal is not None and not self._can_reach(start, goal, forbidden)
+        is_unreachable = goal is not None and not self._can_reach(start, goal, robot, forbidden)
         self._note_unreachable(record, is_unreachable=is_unreachable)
         if is_unreachable or goal is None:
             return self._stand_aside(record, start, forbidden, effort)
@@ -55,7 +55,7 @@ class PathRepair:
             ledger.truncate(robot)
             return True
         roads = self._roads(robot, forbidden)
-        if self._find(record, goal, roads, self._field(goal, forbidden), effort):
+        if self._find(record, goal, roads, self._field(goal, robot, forbidden), effort):
             return True
         if is_enclosed(start, goal, roads):
             # Only robots that take no part are in its way: a plan for all would find no path either.
@@ -128,10 +128,10 @@ class PathRepair:
             path.append((cell, step))
         state.ledger.insert(record.id, path)
 
-    def _can_reach(self, start: int, goal: int, forbidden: frozenset[int]) -> bool:
+    def _can_reach(self, start: int, goal: int, robot: str, forbidden: frozenset[int]) -> bool:
         if self._state.is_shut(goal) or goal in forbidden:
             return False
-        return start == goal or self._field(goal, forbidden)[start] < FAR
+        return start == goal or self._field(goal, robot, forbidden)[start] < FAR
 
     def _roads(self, robot: str, forbidden: frozenset[int]) -> Roads:
         """Return where a robot may drive."""
@@ -143,21 +143,21 @@ class PathRepair:
         return Roads(
             state.grid.neighbours,
             shut,
-            state.zones.closed(state.grid),
+            state.closed(robot),
             state.zones.costs_of(robot),
             frozenset(state.index.goals),
             state.zones.move_costs,
         )
 
-    def _field(self, goal: int, forbidden: frozenset[int]) -> list[int]:
+    def _field(self, goal: int, robot: str, forbidden: frozenset[int]) -> list[int]:
         """Return the number of moves to a goal from each cell, without regard to robots."""
         state = self._state
         if self._version != state.map_version or len(self._fields) >= _FIELDS:
             self._fields.clear()
             self._version = state.map_version
-        found = self._fields.get((goal, forbidden))
+        key = goal, forbidden, state.zones.closed_for(robot, state.grid)
+        found = self._fields.get(key)
         if found is None:
             shut = state.blocked | state.pending | forbidden
-            closed = state.zones.closed(state.grid)
-            found = self._fields[goal, forbidden] = moves_to(goal, state.grid.neighbours, shut, closed)
+            found = self._fields[key] = moves_to(goal, state.grid.neighbours, shut, state.closed(robot))
         return found

@@ -63,6 +63,7 @@ class PlanRequest:
         move_costs: ``(from, to, cost of this move)`` where it is not 1: those of lanes.
         own_costs: ``(indexes of robots, costs)`` where single robots have other costs.
         forbidden: ``(index of a robot, cells that it may not enter)``.
+        own_closed: ``(indexes of robots, moves that only they may not make)``.
         headings: Heading of each robot at its start, see :mod:`rce_fleet.planning.motion`.
         quarter_turn: Time of a quarter turn, in steps; 0: turns are not counted.
         stop: Time lost by stopping and starting, in steps; 0: not counted.
@@ -88,6 +89,7 @@ class PlanRequest:
     move_costs: tuple[tuple[int, int, int], ...] = ()
     own_costs: tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...] = ()
     forbidden: tuple[tuple[int, tuple[int, ...]], ...] = ()
+    own_closed: tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...] = ()
     headings: tuple[int, ...] = ()
     quarter_turn: float = 0.0
     stop: float = 0.0
@@ -176,6 +178,7 @@ def request_plan(
         move_costs=tuple((start, end, cost) for (start, end), cost in state.zones.move_costs.items()),
         own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
+        own_closed=_own_closed(state, robots),
         headings=tuple(_heading(state, robot) for robot in robots) if for_all else (),
         quarter_turn=settings.quarter_turn,
         stop=settings.stop,
@@ -209,6 +212,18 @@ def _own_costs(
         if costs is not common:
             alike.setdefault(id(costs), ([], costs))[0].append(index)
     return tuple((tuple(indexes), tuple(sorted(costs.items()))) for indexes, costs in alike.values())
+
+
+def _own_closed(
+    state: FleetState, robots: list[str]
+) -> tuple[tuple[tuple[int, ...], tuple[tuple[int, int], ...]], ...]:
+    """Return the moves that only some robots may not make, robots with the same zones together."""
+    alike: dict[frozenset[tuple[int, int]], list[int]] = {}
+    for index, robot in enumerate(robots):
+        closed = state.zones.closed_for(robot, state.grid)
+        if closed:
+            alike.setdefault(closed, []).append(index)
+    return tuple((tuple(indexes), tuple(sorted(closed))) for closed, indexes in alike.items())
 
 
 def _forbidden(state: FleetState, robots: list[str]) -> Iterator[tuple[int, tuple[int, ...]]]:
@@ -251,6 +266,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         return PlanResult(request.number, (), (), (), complete=True, rerouting=rerouting)
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
     forbidden = {index: frozenset(cells) for index, cells in request.forbidden}
+    own_closed = {index: frozenset(moves) for indexes, moves in request.own_closed for index in indexes}
     starts = dict(zip(request.robots, request.starts, strict=True))
     targets = assign_targets(
         grid,
@@ -259,6 +275,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         rests={robot: cell for robot, cell in zip(request.robots, request.rests, strict=True) if cell >= 0},
         closed=frozenset(request.closed),
         forbidden={request.robots[index]: cells for index, cells in forbidden.items()},
+        own_closed={request.robots[index]: moves for index, moves in own_closed.items()},
     )
     graph, own_costs = weighted_graph(request, grid)
     problem = PlanningProblem.of(
@@ -283,6 +300,10 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
     ends = ends_of(joint.cells, np.array(request.goals, np.int32), lifelong=True)
     counts = steps <= ends[visitors]
     steps, visitors, cells = steps[counts], visitors[counts], cells[counts]
+    kept = _allowed(request.starts, own_closed, visitors.tolist(), cells.tolist()) if own_closed else None
+    is_cut = kept is not None and not all(kept)
+    if is_cut:
+        steps, visitors, cells = steps[kept], visitors[kept], cells[kept]
     return PlanResult(
         number=request.number,
         visitors=tuple(visitors.tolist()),
@@ -291,9 +312,29 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         unreachable=tuple(
             index for index, robot in enumerate(request.robots) if robot in targets.unreachable
         ),
-        complete=joint.complete,
+        complete=joint.complete and not is_cut,
         ordered=joint.conflict_free,
     )
+
+
+def _allowed(
+    starts: Sequence[int],
+    own_closed: Mapping[int, frozenset[tuple[int, int]]],
+    visitors: Sequence[int],
+    cells: Sequence[int],
+) -> list[bool]:
+    """Return which visits are kept: a route ends before the first move that its robot may not make.
+
+    Such moves cost robots so much that they find other ways; but others may push them there in a plan.
+    """
+    at, ended = list(starts), set()
+    kept = []
+    for robot, cell in zip(visitors, cells, strict=True):
+        if (at[robot], cell) in own_closed.get(robot, ()):
+            ended.add(robot)
+        kept.append(robot not in ended)
+        at[robot] = cell
+    return kept
 
 
 class PlanAdoption:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 NO_CELL = -1
 """In a request: the robot has no such cell."""
+CLOSED = 10_000
+"""Cost of a move that a robot may not make: more than any way around."""
 _MOST_EFFORT = 150_000
 """Work after which a plan for all is made instead: it takes no longer."""
 
@@ -171,6 +173,15 @@ def weighted_graph(
     for robots, pairs in request.own_costs:
         costs = _costs(pairs, moves, grid)
         own |= dict.fromkeys(robots, PlanningGraph.from_grid(grid, costs=costs, closed=request.closed).costs)
+    for robots, closed in request.own_closed:
+        sources = np.repeat(np.arange(len(graph)), np.diff(graph.indptr))
+        shut = np.isin(sources * len(graph) + graph.neighbours, [a * len(graph) + b for a, b in closed])
+        dear: dict[int, NDArray[np.int32]] = {}
+        for robot in robots:
+            before = own.get(robot, graph.costs)
+            if id(before) not in dear:
+                dear[id(before)] = np.where(shut, CLOSED, before).astype(np.int32)
+            own[robot] = dear[id(before)]
     return graph, own or None
 
 

@@ -33,6 +33,7 @@ def assign_targets(
     *,
     closed: frozenset[tuple[int, int]] = frozenset(),
     forbidden: Mapping[str, frozenset[int]] | None = None,
+    own_closed: Mapping[str, frozenset[tuple[int, int]]] | None = None,
 ) -> Targets:
     """Give every robot a target.
 
@@ -46,14 +47,16 @@ def assign_targets(
         rests: Cells where robots without a goal rest; the start by default.
         closed: Moves ``(from, to)`` that no robot may make.
         forbidden: Cells that some robots may not enter.
+        own_closed: Moves that some robots may not make, beside ``closed``.
     """
     cells: dict[str, int] = {}
     unreachable = set()
     reach = _Reach(grid, closed)
-    barred = forbidden or {}
+    barred, shut = forbidden or {}, own_closed or {}
     for robot, goal in goals.items():
         own = barred.get(robot, frozenset())
-        if goal not in grid.blocked and goal not in own and goal in reach.of(starts[robot], own):
+        within = reach.of(starts[robot], own, shut.get(robot, frozenset()))
+        if goal not in grid.blocked and goal not in own and goal in within:
             cells[robot] = goal
         else:
             unreachable.add(robot)
@@ -63,7 +66,8 @@ def assign_targets(
         robot = waiting.popleft()
         start, own = starts[robot], barred.get(robot, frozenset())
         rest = start if robot in unreachable else rests.get(robot, start)
-        cell = _refuge(grid, reach.of(start, own) - own, rest, taken)
+        within = reach.of(start, own, shut.get(robot, frozenset())) - own
+        cell = _refuge(grid, within, rest, taken)
         if cell is None:  # it cannot leave, so another robot that was to come here cannot
             cell = start
             for other in [one for one, target in cells.items() if target == start]:
@@ -84,10 +88,10 @@ class _Reach:
         self._closed = closed
         self._known: dict[int, set[int]] = {}
 
-    def of(self, start: int, forbidden: frozenset[int] = frozenset()) -> set[int]:
+    def of(self, start: int, forbidden: frozenset[int], own_closed: frozenset[tuple[int, int]]) -> set[int]:
         """Return the cells that can be reached from ``start``, with ``start`` itself."""
-        if self._closed or forbidden:
-            return self._search(start, forbidden)
+        if self._closed or forbidden or own_closed:
+            return self._search(start, forbidden, self._closed | own_closed if own_closed else self._closed)
         found = self._known.get(start)
         if found is None:
             found = self._grid.reachable(start)
@@ -95,13 +99,13 @@ class _Reach:
                 self._known.update(dict.fromkeys(found, found))
         return found
 
-    def _search(self, start: int, forbidden: frozenset[int]) -> set[int]:
+    def _search(self, start: int, forbidden: frozenset[int], closed: frozenset[tuple[int, int]]) -> set[int]:
         seen = {start}
         queue = deque(seen)
         while queue:
             cell = queue.popleft()
             for other in self._grid.neighbours[cell]:
-                if other not in seen and other not in forbidden and (cell, other) not in self._closed:
+                if other not in seen and other not in forbidden and (cell, other) not in closed:
                     seen.add(other)
                     queue.append(other)
         return seen

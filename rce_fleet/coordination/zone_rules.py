@@ -24,8 +24,9 @@ class ZoneRules:
     def __init__(self, state: FleetState) -> None:
         zones = state.zones
         self._zones = zones
+        self._grid = state.grid
         self._closed = zones.closed(state.grid)
-        self._forbidden: dict[str, frozenset[int]] = {}
+        self._own: dict[str, tuple[frozenset[int], frozenset[tuple[int, int]]]] = {}
         self._limited = [
             (zone, zones.cells(zone), set(filter(zone.applies_to, state.zone_users(zone))))
             for zone in zones.of_kind(ZoneKind.LIMITED)
@@ -35,10 +36,11 @@ class ZoneRules:
         """Return whether a robot may drive from a cell to the next; count it in the zones that it enters."""
         if (before, cell) in self._closed:
             return False
-        forbidden = self._forbidden.get(robot)
-        if forbidden is None:
-            forbidden = self._forbidden[robot] = self._zones.forbidden(robot)
-        if cell in forbidden and before not in forbidden:
+        own = self._own.get(robot)
+        if own is None:
+            own = self._own[robot] = self._zones.forbidden(robot), self._zones.closed_for(robot, self._grid)
+        forbidden, closed = own
+        if (cell in forbidden and before not in forbidden) or (before, cell) in closed:
             return False
         entered = []
         for zone, cells, users in self._limited:

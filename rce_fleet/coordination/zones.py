@@ -60,7 +60,7 @@ class Zone:
         kind: What it does.
         cells: Its cells, ascending.
         edges: Moves ``(from, to)`` that are blocked; of a blocked zone only.
-        robots: Robots that it applies to; empty: all. Not of one-way zones, or of zones with edges.
+        robots: Robots that it applies to; empty: all.
         speed: Greatest speed in a slow zone, metres per second.
         direction: Of a one-way zone.
         capacity: Robots for which a limited zone has room.
@@ -120,10 +120,6 @@ class Zone:
                 f"{where}: only a blocked zone has edges",
             ),
             (
-                bool(self.robots) and (bool(self.edges) or self.kind is ZoneKind.ONE_WAY),
-                f"{where}: edges and one-way zones apply to all robots; leave its robots empty",
-            ),
-            (
                 self.kind is ZoneKind.SLOW and not LEAST_SPEED <= self.speed <= MOST_SPEED,
                 f"{where}: a slow zone needs {LEAST_SPEED} .. {MOST_SPEED:g} m/s, not {self.speed}",
             ),
@@ -172,6 +168,7 @@ class ZoneBook:
         self._cells: dict[str, frozenset[int]] = {}
         self._blocking: dict[int, Zone] | None = None
         self._forbidden: dict[tuple[str, ...], frozenset[int]] = {}
+        self._own_closed: dict[tuple[str, ...], frozenset[tuple[int, int]]] = {}
 
     # Changes
 
@@ -234,22 +231,30 @@ class ZoneBook:
             grid: The map, always the same one.
         """
         if self._closed is None:
-            closed: set[tuple[int, int]] = set()
-            for zone in self.of_kind(ZoneKind.BLOCKED):
-                closed.update(zone.edges)
-            for zone in self.of_kind(ZoneKind.ONE_WAY):
-                assert zone.direction is not None
-                against = zone.direction.against(grid.columns)
-                for cell in zone.cells:
-                    closed |= {(cell, cell + against), (cell - against, cell)}
             if self.lanes is not None and self._off_lanes is None:
                 self._off_lanes = self.lanes.closed(grid)
-            self._closed = (self._off_lanes or frozenset()).union(
-                (start, end)
-                for start, end in closed
-                if start in grid and end in grid and grid.adjacent(start, end)
-            )
+            zones = [zone for zone in self.zones.values() if not zone.robots]
+            self._closed = (self._off_lanes or frozenset()) | _closed_by(zones, grid)
         return self._closed
+
+    def closed_for(self, robot: str, grid: GridMap) -> frozenset[tuple[int, int]]:
+        """Return the moves ``(from, to)`` that one robot may not make, but others may.
+
+        Args:
+            robot: The robot. Robots with the same zones share one object.
+            grid: The map, always the same one.
+        """
+        kinds = (ZoneKind.BLOCKED, ZoneKind.ONE_WAY)
+        zones = [
+            zone
+            for zone in self.zones.values()
+            if zone.robots and zone.kind in kinds and zone.applies_to(robot)
+        ]
+        key = tuple(zone.id for zone in zones)
+        found = self._own_closed.get(key)
+        if found is None:
+            found = self._own_closed[key] = _closed_by(zones, grid)
+        return found
 
     @property
     def move_costs(self) -> Mapping[tuple[int, int], int]:
@@ -309,6 +314,20 @@ class ZoneBook:
                 if len(others) >= zone.capacity:
                     found.append(self.cells(zone))
         return union_of(found)
+
+
+def _closed_by(zones: Iterable[Zone], grid: GridMap) -> frozenset[tuple[int, int]]:
+    """Return the moves between cells of a map that some zones do not allow."""
+    closed: set[tuple[int, int]] = set()
+    for zone in zones:
+        closed.update(zone.edges)
+        if zone.direction is not None and zone.kind is ZoneKind.ONE_WAY:
+            against = zone.direction.against(grid.columns)
+            for cell in zone.cells:
+                closed |= {(cell, cell + against), (cell - against, cell)}
+    return frozenset(
+        (start, end) for start, end in closed if start in grid and end in grid and grid.adjacent(start, end)
+    )
 
 
 def union_of(sets: Sequence[frozenset[int]]) -> frozenset[int]:

@@ -125,10 +125,8 @@ def _problems(zone: Zone, grid: GridMap | None, now: float) -> Iterator[str]:
         yield f"it ends at {zone.until:.0f}, which is not after now ({now:.0f}), seconds since 1970"
     if not zone.cells and not zone.edges:
         yield "it has no cells"
-    if zone.edges and (zone.kind != "blocked" or zone.robots):
-        yield "edges are moves that a blocked zone does not allow any robot"
-    if zone.robots and zone.kind == "one_way":
-        yield "a one-way zone is for all robots; leave robots empty"
+    if zone.edges and zone.kind != "blocked":
+        yield "edges are moves that a blocked zone does not allow"
     if value is None and zone.kind != "blocked":
         yield f"the kind {zone.kind} needs a value"
     if value is not None:

@@ -216,9 +216,12 @@ def _search(
     turning: Turning | None = None,
     effort: int = 0,
 ) -> _Found:
+    table = _table(part, graph, part.own_costs)
+    if turning is None and not problem.is_unweighted:
+        turning = Turning.without_turns(graph, table, part.own_costs)
     search = ConfigurationSearch(
         graph,
-        _table(part, graph, part.own_costs),
+        table,
         part.goals,
         rotations=problem.rotations,
         seed=seed,

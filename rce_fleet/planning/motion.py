@@ -26,9 +26,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int32]
+    Table = NDArray[np.int16] | NDArray[np.int32]
 
 UNITS = 4
 """Units of cost in one step: turns are counted in quarters of a step."""
+_FAR = 2**26
+"""Cost of a way at most, so that sums in units fit into 32 bits."""
 UNKNOWN = 4
 """An unknown heading: the first move needs no turn. Headings are ``DOWN``, ``LEFT``, ``RIGHT``, ``UP``."""
 _COUNTER_CLOCKWISE = (RIGHT, UP, LEFT, DOWN)
@@ -151,6 +154,23 @@ class Turning:
         costs = np.zeros((UNKNOWN + 1, 4), np.int32)
         zeros = np.zeros(robots, np.int32)
         return cls(zeros, np.zeros((0, 0), np.int32), np.zeros(0, np.int32), costs, zeros)
+
+    @classmethod
+    def without_turns(cls, graph: PlanningGraph, table: Table, own_costs: Mapping[int, Ints]) -> Turning:
+        """Return what makes PIBT count the cost of the next edge, which distances of nodes do not have.
+
+        Args:
+            graph: Where robots drive.
+            table: Distances to the goals, shape (robots, nodes).
+            own_costs: Costs of all edges for some robots, by the robot's index.
+        """
+        aims = np.minimum(table[:, graph.neighbours].astype(np.int32), _FAR) + graph.costs
+        for robot, costs in own_costs.items():
+            aims[robot] += costs - graph.costs
+        robots, edges = aims.shape
+        turns, directions = np.zeros((UNKNOWN + 1, 4), np.int32), np.zeros(edges, np.int32)
+        aims = np.ascontiguousarray(np.minimum(aims, _FAR) * UNITS)
+        return cls(np.ones(robots, np.int32), aims, directions, turns, np.zeros(robots, np.int32))
 
     @classmethod
     def of(

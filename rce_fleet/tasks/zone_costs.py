@@ -27,7 +27,7 @@ def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> d
     zones = [
         zone
         for zone in book.zones.values()
-        if zone.kind == "cost" or (zone.kind == "blocked" and zone.robots)
+        if zone.kind == "cost" or (zone.kind == "blocked" and zone.robots and zone.cells)
     ]
     if not zones:
         return {}

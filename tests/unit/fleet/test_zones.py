@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -9,10 +11,12 @@ import pytest
 
 from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, SendCells, Tick, ZonesSet
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.replanning import PlanRequest, compute_plan
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
 from rce_fleet.coordination.zones import Direction, Zone, ZoneBook, ZoneKind
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.planner import JointPlan, PlanningProblem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -207,7 +211,6 @@ def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
         (blocked("a"), "zone 'a' has no cells"),
         (blocked("a", 27), r"zone 'a': cells \[27\] are not on the map of 27 cells"),
         (blocked("a", edges=((0, 2),)), "are not neighbours"),
-        (blocked("a", edges=((0, 1),), robots=("Robot1",)), "apply to all robots"),
         (Zone("a", ZoneKind.SLOW, (1,)), "needs 0.01 .. 100 m/s, not 0.0"),
         (Zone("a", ZoneKind.SLOW, (1,), speed=1e-320), "needs 0.01 .. 100 m/s, not 1e-320"),
         (Zone("a", ZoneKind.LIMITED, (1,), capacity=2**31 - 1), "capacity of 1 .. 1000000, not 2147483647"),
@@ -280,6 +283,89 @@ def test_zone_for_one_robot_costs_only_this_one(
     assert 22 in robot(fleet, 1).plan
     assert 4 in robot(fleet, 2).plan
     fleet.run(fleet.all_arrived)
+
+
+SETTINGS = {
+    "one by one": FleetSettings(repairs=24),
+    "beside": FleetSettings(repairs=1),
+    "for all": FleetSettings(repairs=0),
+    "with turns": FleetSettings(repairs=0, quarter_turn=1.0, stop=0.5),
+    "dijkstra": FleetSettings(planner="dijkstra", resolve_deadlocks=True),
+}
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_moves_are_closed_for_one_robot_only(
+    make_fleet: type[SimulatedClients], settings: FleetSettings
+) -> None:
+    """To the right there is one way for Robot1, in row 2; the others take the shortest, also when pushed."""
+    planner = FleetPlanner(GridMap(3, 9), settings)
+    fleet = make_fleet(planner, [0, 9, 26], 1)
+    closed = {(3, 4), (12, 13)}
+    planner.state.zones.put(
+        [
+            blocked("shut", edges=((3, 4),), robots=("Robot1",)),
+            Zone("back", ZoneKind.ONE_WAY, (13,), robots=("Robot1",), direction=Direction.MINUS_X),
+        ]
+    )
+    driven: dict[str, set[tuple[int, int]]] = {name: set() for name in fleet.robots}
+
+    def arrived() -> bool:
+        for name in fleet.robots:
+            driven[name].update(pairwise(planner.state.ledger.granted(name)))
+        return fleet.all_arrived()
+
+    fleet.send([8, 17, 1])
+    fleet.run(arrived)
+    for name, goal in zip(fleet.robots, [2, 9, 7], strict=True):
+        assert fleet.ask(GoalSet(name, goal)).ok
+    fleet.run(arrived)
+    for name, goal in zip(fleet.robots, [16, 8, 0], strict=True):
+        assert fleet.ask(GoalSet(name, goal)).ok
+    fleet.run(arrived)
+    assert (21, 22) in driven["Robot1"]
+    assert closed.isdisjoint(driven["Robot1"])
+    assert not closed.isdisjoint(driven["Robot2"])
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_closing_all_ways_of_a_robot_stops_it(
+    make_fleet: type[SimulatedClients], settings: FleetSettings
+) -> None:
+    """Its path is taken away; the zone's end gives it another."""
+    fleet = make_fleet(FleetPlanner(GridMap(1, 9), settings), [0], 1, loss=0.0)
+    fleet.send([8])
+    fleet.run(lambda: robot(fleet).cell in (1, 2, 3))
+    put(fleet, blocked("shut", edges=((6, 7),), robots=("Robot1",)))
+    fleet.run(lambda: fleet.states() == [RobotState.UNREACHABLE])
+    assert 7 not in robot(fleet).plan
+    assert fleet.ask(ZonesSet((), remove=("shut",))).ok
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_plan_ends_before_a_move_that_is_closed_for_its_robot() -> None:
+    """Of a planner that ignores costs of single robots."""
+
+    class Careless:
+        def plan(self, problem: PlanningProblem) -> JointPlan:
+            return JointPlan.of([[0, 8], [1, 8], [2, 7]], complete=True)
+
+    request = PlanRequest(
+        number=0,
+        rows=1,
+        columns=9,
+        blocked=(),
+        robots=("Robot1", "Robot2"),
+        starts=(0, 8),
+        goals=(2, 7),
+        rests=(-1, -1),
+        seed=0,
+        effort=100,
+        own_closed=(((1,), ((1, 2),)), ((0,), ((2, 1),))),
+    )
+    assert compute_plan(request, Careless()).complete
+    made = compute_plan(replace(request, own_closed=(((0,), ((1, 2),)),)), Careless())
+    assert (made.visitors, made.cells, made.complete) == ((0, 1), (1, 7), False)
 
 
 def test_a_cost_zone_is_avoided_by_all(make: Make) -> None:

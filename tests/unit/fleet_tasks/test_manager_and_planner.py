@@ -70,6 +70,16 @@ async def test_zones_that_cannot_be(client: ManagerClient, zone: Any, status: in
     assert (said, text in answer["error"]) == (status, True), answer
 
 
+async def test_moves_are_closed_for_single_robots(client: ManagerClient) -> None:
+    """Also by the direction of an aisle."""
+    for body in (
+        {"kind": "blocked", "edges": [[3, 4]], "robots": ["Robot1"]},
+        {"kind": "one_way", "cells": [3, 4], "value": 0.0, "robots": ["Robot1"]},
+    ):
+        status, made, _ = await client.ask("PUT", "/zones/own", body)
+        assert (status in (200, 201), made["robots"]) == (True, ["Robot1"])
+
+
 async def test_former_words_of_zones_are_understood(client: ManagerClient) -> None:
     body = {"kind": "room", "cells": [3], "value": 2}
     assert (await client.ask("PUT", "/zones/lift", body))[1]["kind"] == "limited"

@@ -11,6 +11,7 @@ import pytest
 
 from rce_fleet.exceptions import LanesError
 from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lane_files import parse_lanes, read_lanes
 from rce_fleet.planning.lanes import Lane, LaneGraph
@@ -169,3 +170,12 @@ def test_time_that_is_left_makes_no_dearer_plan(motion: Motion | None) -> None:
     assert 12 in joint.path(0)
     assert problem.extra_cost(joint.cells) == 0
     assert problem.extra_cost(np.arange(5, dtype=np.int32)[:, None]) == 4 * 7
+
+
+def test_a_dear_edge_of_one_robot_is_not_taken() -> None:
+    """The way behind it is short, and without this edge there is one around."""
+    graph = PlanningGraph.from_grid(GridMap(2, 4))
+    sources = np.repeat(np.arange(len(graph)), np.diff(graph.indptr))
+    dear = np.where((sources == 1) & (graph.neighbours == 2), 100, graph.costs).astype(np.int32)
+    problem = PlanningProblem.of(graph, starts=[1, 5], goals=[3, 4], own_costs={0: dear})
+    assert load_planner("lacam").plan(problem).path(0) == [1, 5, 6, 7, 3]
