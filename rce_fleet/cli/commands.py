@@ -1,4 +1,4 @@
-"""``rce fleet``: robots, cells and events; tasks are in :mod:`rce_fleet.cli.tasks`."""
+"""``rce fleet``: robots and events; tasks, zones and blocked places have modules of their own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce.printable import for_terminal, one_line
-from rce_fleet.cli import tasks, zones
+from rce_fleet.cli import blocking, tasks, zones
 from rce_fleet.cli.access import (
     STATION,
     AsJson,
@@ -41,7 +41,6 @@ def fleet(token: Token = "", send_login: SendLogin = False) -> None:
 
 
 Robot = Annotated[str, typer.Argument(help="The robot.")]
-Cells = Annotated[list[int], typer.Argument(metavar="CELL...", help="Numbers of cells.")]
 Reason = Annotated[str, typer.Option(help="For people.")]
 
 
@@ -131,25 +130,8 @@ def put_in(robot: Robot, station: Station = STATION) -> None:
     do(station, work)
 
 
-@app.command("block")
-def block(cells: Cells, station: Station = STATION) -> None:
-    """Block cells for all robots; a zone can also have a reason and an end."""
-    _set_blocked(cells, station, blocked=True)
-
-
-@app.command("free")
-def free(cells: Cells, station: Station = STATION) -> None:
-    """Free blocked cells."""
-    _set_blocked(cells, station, blocked=False)
-
-
-def _set_blocked(cells: list[int], station: str, *, blocked: bool) -> None:
-    async def work(client: FleetClient) -> None:
-        for cell in cells:
-            await client.set_blocked(cell, blocked=blocked)
-            typer.echo(f"cell {cell} is {'blocked' if blocked else 'free'}")
-
-    do(station, work)
+app.command("block")(blocking.block)
+app.command("free")(blocking.free)
 
 
 @app.command("watch")

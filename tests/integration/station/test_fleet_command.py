@@ -6,17 +6,27 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from rce_fleet.api.fleet import FleetRobotModel, RobotList, StatisticsModel, ZoneList, ZoneModel
+from rce_fleet.api.fleet import (
+    FleetMapModel,
+    FleetRobotModel,
+    RobotList,
+    StatisticsModel,
+    ZoneList,
+    ZoneModel,
+)
 from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
 from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
+from rce_fleet.cli.blocking import read_time
 from rce_fleet.cli.commands import app as commands
 from rce_master.cli.credentials import FILE_VARIABLE
 
@@ -63,6 +73,19 @@ ROBOT = FleetRobotModel.model_validate(
     }
 )
 ZONE = ZoneModel(id="gate", kind="blocked", cells=[4], edges=[[12, 13]], user="ada", revision=1)
+LANE = {"name": "bay", "cells": [4, 12, 20], "one_way": False, "speed": 0.0, "width": 0.0, "cost": 1}
+MAP = FleetMapModel.model_validate(
+    {
+        "rows": 8,
+        "columns": 8,
+        "cell_size": 1.0,
+        "origin": [0.0, 0.0],
+        "yaw": 0.0,
+        "walls": [],
+        "blocked": [],
+        "lanes": [LANE, {**LANE, "name": "out", "cells": [0, 1], "one_way": True}],
+    }
+)
 FIGURES = StatisticsModel.model_validate(dict.fromkeys(StatisticsModel.model_fields, 0))
 
 
@@ -73,6 +96,7 @@ class Station:
         self.tokens: list[str] = []
         self.bodies: list[Any] = []
         self.changes: list[str] = []
+        self.zones: list[str] = []
         self.wants = ""
         """The token that it asks for; empty: none."""
 
@@ -85,21 +109,24 @@ class Station:
         path = request.path.removeprefix("/api/v1/")
         if request.method != "GET":
             self.changes.append(f"{request.method} {path}")
-        if path.startswith("robots/"):
-            shown = ROBOT.model_dump_json()
-        elif path == "robots":
-            shown = RobotList(robots=[ROBOT]).model_dump_json()
-        elif path == "tasks" and request.method == "GET":
-            shown = TaskPage(tasks=[TASK], next=None).model_dump_json()
-        elif path == "zones":
-            shown = ZoneList(zones=[ZONE]).model_dump_json()
-        elif path.startswith("zones/"):
-            shown = ZONE.model_dump_json()
-        elif path == "statistics":
-            shown = FIGURES.model_dump_json()
-        else:
-            shown = TASK.model_dump_json()
+        shown = self.shown(path, request.method).model_dump_json()
         return web.Response(text=shown, content_type="application/json")
+
+    def shown(self, path: str, method: str) -> BaseModel:
+        """Return what the station answers to a request."""
+        if path.startswith("robots/"):
+            return ROBOT
+        if path.startswith("zones/"):
+            return ZONE
+        zones = [ZONE.model_copy(update={"id": name}) for name in self.zones]
+        found = {
+            "robots": RobotList(robots=[ROBOT]),
+            "map": MAP,
+            "zones": ZoneList(zones=[ZONE, *zones]),
+            "statistics": FIGURES,
+        }
+        is_list = path == "tasks" and method == "GET"
+        return TaskPage(tasks=[TASK], next=None) if is_list else found.get(path, TASK)
 
 
 @pytest.fixture
@@ -276,3 +303,81 @@ async def test_rce_fleet_shows_a_question_with_its_answer(url: str) -> None:
 async def test_rce_fleet_refuses_an_unclear_load(station: Station, url: str, words: str) -> None:
     code, told = await run(url, "task", "load", "T7", *words.split())
     assert (code, "Invalid value" in told, station.changes) == (2, True, []), told
+
+
+async def test_cells_are_blocked_with_a_reason_an_end_and_robots(station: Station, url: str) -> None:
+    code, told = await run(url, "block", "4", "5")
+    assert (code, told) == (0, "cell 4 is blocked\ncell 5 is blocked\n")
+    assert station.changes == ["PUT cells/4", "PUT cells/5"]
+    station.changes.clear()
+    station.bodies.clear()
+    began = time.time()
+    code, told = await run(
+        url, "block", "4", "4>5", "--robot", "R2", "--robot", "R1", "--reason", "oil", "--for", "60"
+    )
+    assert (code, told.splitlines()[1].split(" until ")[0]) == (0, "the move 4>5 is blocked for R1, R2")
+    assert station.changes == ["PUT zones/block 4 for R1 R2", "PUT zones/block 4>5 for R1 R2"]
+    cell, move = station.bodies
+    assert (cell["cells"], cell["edges"], cell["robots"], cell["reason"]) == ([4], [], ["R1", "R2"], "oil")
+    assert (move["cells"], move["edges"]) == ([], [[4, 5]])
+    assert 60 <= cell["until"] - began < 120
+
+
+async def test_lanes_are_blocked_by_their_names(station: Station, url: str) -> None:
+    code, told = await run(url, "block", "--lane", "bay", "--lane", "out")
+    assert (code, told) == (0, "lane bay is blocked\nlane out is blocked\n")
+    assert station.changes == ["PUT zones/block lane bay", "PUT zones/block lane out"]
+    assert [zone["edges"] for zone in station.bodies] == [[[4, 12], [12, 20], [12, 4], [20, 12]], [[0, 1]]]
+    code, told = await run(url, "block", "--lane", "in")
+    assert (code, "there is no lane 'in'; lanes are bay, out" in " ".join(told.split())) == (2, True)
+
+
+async def test_what_was_blocked_is_freed(station: Station, url: str) -> None:
+    """For one robot only what was blocked for it; without one, everything of the place."""
+    station.zones = [
+        "block 4",
+        "block 4 for R1",
+        "block 4 for R1 R2",
+        "block 4>5",
+        "block 44",
+        "block lane bay",
+    ]
+    assert await run(url, "free", "4", "--robot", "R1") == (0, "cell 4 is free for R1\n")
+    assert station.changes == ["DELETE zones/block 4 for R1"]
+    station.changes.clear()
+    assert await run(url, "free", "4", "4>5", "--lane", "bay") == (
+        0,
+        "cell 4 is free\nthe move 4>5 is free\nlane bay is free\n",
+    )
+    assert station.changes == [
+        *(f"DELETE zones/block 4{whom}" for whom in ("", " for R1", " for R1 R2")),
+        "PUT cells/4",
+        "DELETE zones/block 4>5",
+        "DELETE zones/block lane bay",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ((), "name a cell, such as 12, a move, such as 12>13, or a --lane"),
+        (("4>",), "expected a cell, such as 12, or a move, such as 12>13, found '4>'"),
+        (("4", "--for", "9", "--until", "23:59"), "give either --for or --until"),
+        (("4", "--until", "soon"), "expected a time such as 18:30 or 2026-11-28T18:30, found 'soon'"),
+        (("4", "--until", "25:00"), "expected a time such as 18:30"),
+        (("4", "--until", "2020-01-01"), "2020-01-01 has passed"),
+    ],
+)
+async def test_places_and_times_that_are_none(
+    station: Station, url: str, words: tuple[str, ...], text: str
+) -> None:
+    code, told = await run(url, "block", *words)
+    assert (code, station.changes) == (2, [])
+    assert text in " ".join(told.replace("│", " ").split())
+
+
+def test_a_time_of_day_is_the_next_one() -> None:
+    now = datetime(2026, 11, 27, 12, 0).astimezone().timestamp()
+    assert read_time("18:30", now) - now == 6.5 * 3600
+    assert read_time("11:30", now) - now == 23.5 * 3600
+    assert read_time("2026-11-28T12:00", now) - now == 24 * 3600

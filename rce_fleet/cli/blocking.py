@@ -1,0 +1,179 @@
+"""``rce fleet block`` and ``free``: cells, moves and lanes, for all robots or for some, for a time.
+
+A cell that is blocked for all robots until it is freed has no zone. Everything else is a zone that is named
+after its place, so that ``free`` finds it: ``block 12``, ``block 12>13 for Robot1``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce_fleet.api.fleet import ZoneRequest
+from rce_fleet.cli.access import STATION, Station, checked, do
+from rce_fleet.exceptions import StationError
+
+if TYPE_CHECKING:
+    from rce_fleet.api.fleet import LaneModel
+    from rce_fleet.client import FleetClient
+
+Places = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="PLACE...", help="Cells, such as 12, or moves, such as 12>13 (in quotes)."),
+]
+Lanes = Annotated[list[str] | None, typer.Option("--lane", help="A lane, by its name; may be repeated.")]
+Robots = Annotated[
+    list[str] | None, typer.Option("--robot", help="A robot that it is for [all]; may be repeated.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What is blocked: cells or moves, and its name."""
+
+    name: str
+    cells: tuple[int, ...] = ()
+    edges: tuple[tuple[int, int], ...] = ()
+
+    def zone(self, robots: list[str]) -> str:
+        """Return the name of its zone for these robots."""
+        return f"block {self.name}" + (f" for {' '.join(robots)}" if robots else "")
+
+
+def block(
+    places: Places = None,
+    lane: Lanes = None,
+    robot: Robots = None,
+    reason: Annotated[str, typer.Option(help="For people.")] = "",
+    lasts: Annotated[float, typer.Option("--for", help="Seconds until it ends; 0: it stays.", min=0.0)] = 0.0,
+    until: Annotated[
+        str, typer.Option(help="When it ends, such as 18:30 or 2026-11-28T18:30; local time.")
+    ] = "",
+    station: Station = STATION,
+) -> None:
+    """Block cells, moves or lanes, for all robots or some."""
+    found, robots = _places(places, lane), sorted(set(robot or ()))
+    if lasts and until:
+        raise typer.BadParameter("give either --for or --until", param_hint="--until")
+    end = time.time() + lasts if lasts else read_time(until, time.time()) if until else None
+
+    async def work(client: FleetClient) -> None:
+        for place in [*found, *await _lanes(client, lane)]:
+            if place.cells and not (robots or reason or end):
+                await client.set_blocked(place.cells[0], blocked=True)
+            else:
+                with checked():
+                    asked = ZoneRequest.model_validate(
+                        {
+                            "kind": "blocked",
+                            "cells": place.cells,
+                            "edges": place.edges,
+                            "robots": robots,
+                            "reason": reason,
+                            "until": end,
+                        }
+                    )
+                await client.set_zone(place.zone(robots), asked)
+            whom = f" for {', '.join(robots)}" if robots else ""
+            when = f" until {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(end))}" if end else ""
+            typer.echo(f"{_word(place)} is blocked{whom}{when}")
+
+    do(station, work)
+
+
+def free(
+    places: Places = None,
+    lane: Lanes = None,
+    robot: Robots = None,
+    station: Station = STATION,
+) -> None:
+    """Free what was blocked; without robots, for all and for each."""
+    found, robots = _places(places, lane), sorted(set(robot or ()))
+    found += [_Place(f"lane {name}") for name in lane or ()]
+
+    async def work(client: FleetClient) -> None:
+        zones: list[str] = []
+        with contextlib.suppress(StationError):  # without a fleet manager there are cells only
+            zones = [zone.id for zone in await client.zones()]
+        for place in found:
+            for zone in zones:
+                is_for_some = zone.startswith(f"{place.zone([])} for ")
+                if zone == place.zone(robots) or (is_for_some and not robots):
+                    await client.remove_zone(zone)
+            if place.cells and not robots:
+                await client.set_blocked(place.cells[0], blocked=False)
+            typer.echo(f"{_word(place)} is free" + (f" for {', '.join(robots)}" if robots else ""))
+
+    do(station, work)
+
+
+def read_time(text: str, now: float) -> float:
+    """Return a local time, or a time of day that comes next, in seconds since 1970.
+
+    Raises:
+        typer.BadParameter: The text is not a time, or it has passed.
+    """
+    today = datetime.fromtimestamp(now).astimezone().replace(tzinfo=None)
+    try:
+        if "-" in text:
+            found = datetime.fromisoformat(text)
+        else:
+            hour, minute = map(int, text.split(":"))
+            found = today.replace(hour=hour, minute=minute, second=0, microsecond=0)
+            found += timedelta(days=found <= today)
+    except ValueError:
+        raise typer.BadParameter(
+            f"expected a time such as 18:30 or 2026-11-28T18:30, found {text!r}", param_hint="--until"
+        ) from None
+    end = found.astimezone().timestamp()
+    if end <= now:
+        raise typer.BadParameter(f"{text} has passed", param_hint="--until")
+    return end
+
+
+def _places(texts: list[str] | None, lanes: list[str] | None) -> list[_Place]:
+    if not texts and not lanes:
+        raise typer.BadParameter("name a cell, such as 12, a move, such as 12>13, or a --lane")
+    return [_place(text) for text in texts or ()]
+
+
+def _place(text: str) -> _Place:
+    start, arrow, end = text.partition(">")
+    if not start.isdecimal() or (arrow and not end.isdecimal()):
+        raise typer.BadParameter(f"expected a cell, such as 12, or a move, such as 12>13, found {text!r}")
+    if arrow:
+        return _Place(f"{int(start)}>{int(end)}", edges=((int(start), int(end)),))
+    return _Place(str(int(start)), cells=(int(start),))
+
+
+async def _lanes(client: FleetClient, names: list[str] | None) -> list[_Place]:
+    """Return the moves of lanes.
+
+    Raises:
+        typer.BadParameter: There is no such lane.
+    """
+    if not names:
+        return []
+    lanes = {lane.name: lane for lane in (await client.map()).lanes}
+    unknown = [name for name in names if name not in lanes]
+    if unknown:
+        known = ", ".join(sorted(lanes)) or "none"
+        raise typer.BadParameter(f"there is no lane {unknown[0]!r}; lanes are {known}", param_hint="--lane")
+    return [_Place(f"lane {name}", edges=_moves(lanes[name])) for name in names]
+
+
+def _moves(lane: LaneModel) -> tuple[tuple[int, int], ...]:
+    there = tuple(pairwise(lane.cells))
+    return there if lane.one_way else (*there, *((end, start) for start, end in there))
+
+
+def _word(place: _Place) -> str:
+    if place.cells:
+        return f"cell {place.name}"
+    return place.name if place.name.startswith("lane ") else f"the move {place.name}"
