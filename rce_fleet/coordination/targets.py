@@ -81,7 +81,7 @@ def assign_targets(
 
 
 class _Reach:
-    """Cells that can be reached from a start; without one-way moves each connected part is searched once."""
+    """Cells that can be reached from a start; cells that can be reached from each other are searched once."""
 
     def __init__(self, grid: GridMap, closed: frozenset[tuple[int, int]]) -> None:
         self._grid = grid
@@ -90,13 +90,17 @@ class _Reach:
 
     def of(self, start: int, forbidden: frozenset[int], own_closed: frozenset[tuple[int, int]]) -> set[int]:
         """Return the cells that can be reached from ``start``, with ``start`` itself."""
-        if self._closed or forbidden or own_closed:
+        if forbidden or own_closed:
             return self._search(start, forbidden, self._closed | own_closed if own_closed else self._closed)
         found = self._known.get(start)
-        if found is None:
+        if found is None and not self._closed:
             found = self._grid.reachable(start)
             if start not in self._grid.blocked:
                 self._known.update(dict.fromkeys(found, found))
+        elif found is None:
+            found = self._search(start, forbidden, self._closed)
+            alike = found & self._search_back(start)
+            self._known.update(dict.fromkeys(alike, found))
         return found
 
     def _search(self, start: int, forbidden: frozenset[int], closed: frozenset[tuple[int, int]]) -> set[int]:
@@ -106,6 +110,20 @@ class _Reach:
             cell = queue.popleft()
             for other in self._grid.neighbours[cell]:
                 if other not in seen and other not in forbidden and (cell, other) not in closed:
+                    seen.add(other)
+                    queue.append(other)
+        return seen
+
+    def _search_back(self, end: int) -> set[int]:
+        """Return the cells from which ``end`` can be reached, with ``end`` itself."""
+        grid, closed, seen = self._grid, self._closed, {end}
+        queue = deque(seen)
+        while queue:
+            cell = queue.popleft()
+            if cell in grid.blocked:
+                continue  # no move enters it
+            for other in grid.around(cell):
+                if other not in seen and (other, cell) not in closed:
                     seen.add(other)
                     queue.append(other)
         return seen

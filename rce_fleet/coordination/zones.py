@@ -169,6 +169,8 @@ class ZoneBook:
         self._blocking: dict[int, Zone] | None = None
         self._forbidden: dict[tuple[str, ...], frozenset[int]] = {}
         self._own_closed: dict[tuple[str, ...], frozenset[tuple[int, int]]] = {}
+        self._closing: list[Zone] | None = None
+        """Zones that close moves for some robots."""
 
     # Changes
 
@@ -244,16 +246,14 @@ class ZoneBook:
             robot: The robot. Robots with the same zones share one object.
             grid: The map, always the same one.
         """
-        kinds = (ZoneKind.BLOCKED, ZoneKind.ONE_WAY)
-        zones = [
-            zone
-            for zone in self.zones.values()
-            if zone.robots and zone.kind in kinds and zone.applies_to(robot)
-        ]
-        key = tuple(zone.id for zone in zones)
+        if self._closing is None:
+            zones = self.zones.values()
+            self._closing = [zone for zone in zones if zone.robots and (zone.edges or zone.direction)]
+        own = [zone for zone in self._closing if zone.applies_to(robot)]
+        key = tuple(zone.id for zone in own)
         found = self._own_closed.get(key)
         if found is None:
-            found = self._own_closed[key] = _closed_by(zones, grid)
+            found = self._own_closed[key] = _closed_by(own, grid)
         return found
 
     @property

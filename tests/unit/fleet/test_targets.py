@@ -53,3 +53,30 @@ def test_targets_are_all_different(data: st.DataObject) -> None:
     )
     assert sorted(found.cells) == sorted(robots)
     assert len(set(found.cells.values())) == len(robots)
+
+
+@given(st.data())
+def test_targets_can_be_reached_over_open_moves(data: st.DataObject) -> None:
+    """Whatever moves are closed; robots without a reachable goal are told."""
+    rows, columns = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
+    cells = st.integers(0, rows * columns - 1)
+    grid = GridMap(rows, columns, blocked=data.draw(st.frozensets(cells, max_size=3)))
+    moves = [(cell, other) for cell in range(len(grid)) for other in grid.around(cell)]
+    closed = data.draw(st.frozensets(st.sampled_from(moves))) if moves else frozenset()
+    starts = dict(enumerate(data.draw(st.lists(cells, unique=True, max_size=5))))
+    goals = dict(zip(starts, data.draw(st.lists(cells, unique=True, max_size=len(starts))), strict=False))
+    named = {f"R{robot}": cell for robot, cell in starts.items()}
+    wanted = {f"R{robot}": cell for robot, cell in goals.items()}
+    found = assign_targets(grid, named, wanted, {}, closed=closed)
+    for robot, start in named.items():
+        seen, rest = {start}, [start]
+        while rest:
+            cell = rest.pop()
+            for other in grid.neighbours[cell]:
+                if other not in seen and (cell, other) not in closed:
+                    seen.add(other)
+                    rest.append(other)
+        assert found.cells[robot] in seen
+        goal = wanted.get(robot)
+        if goal is not None and (goal not in seen or goal in grid.blocked):
+            assert robot in found.unreachable

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import re
 from math import inf
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rce_fleet.exceptions import LanesError
 from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.fields import UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lane_files import parse_lanes, read_lanes
 from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import PlanningProblem, load_planner
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 GRID = GridMap(4, 5, cell_size=0.5, origin=(1.0, 2.0), blocked=frozenset({7}))
 """::
@@ -179,3 +179,15 @@ def test_a_dear_edge_of_one_robot_is_not_taken() -> None:
     dear = np.where((sources == 1) & (graph.neighbours == 2), 100, graph.costs).astype(np.int32)
     problem = PlanningProblem.of(graph, starts=[1, 5], goals=[3, 4], own_costs={0: dear})
     assert load_planner("lacam").plan(problem).path(0) == [1, 5, 6, 7, 3]
+
+
+def test_the_lanes_of_the_page_can_be_driven(tmp_path: Path) -> None:
+    """Each cell of them can be reached from each other one."""
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "lanes.md").read_text(encoding="utf-8")
+    file = tmp_path / "lanes.yaml"
+    file.write_text(dedent(page.partition("```yaml\n")[2].partition("   ```")[0]))
+    grid = GridMap(2, 8)
+    lanes = read_lanes(file, grid)
+    cells = sorted(lanes.cells)
+    assert len(cells) == 16
+    assert (distance_fields(lanes.graph(grid), cells)[:, cells] < UNREACHABLE).all()
