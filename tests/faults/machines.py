@@ -41,6 +41,7 @@ class Machine:
         master_launcher: The program, and its arguments, that starts the master.
         master_state: The state folder of the master, from its next start on; None: the usual one.
         master_env: More variables of the master's environment, from its next start on.
+        store: The address of the master's store, from its next start on; empty: the usual one.
     """
 
     def __init__(self, place: NetworkMachine, number: int, folder: Path) -> None:
@@ -53,6 +54,7 @@ class Machine:
         self.master_launcher: tuple[str, ...] = ()
         self.master_state: Path | None = None
         self.master_env: Mapping[str, str] = {}
+        self.store = ""
         self.cluster_state = "new"
         self.env = environment(folder)
         self.member = Program(f"etcd-{self.name}", [], self.env, folder)
@@ -137,7 +139,7 @@ class Cluster:
 
     async def start_master(self, machine: Machine) -> None:
         """Start a master."""
-        await machine.start_master(self.store_of(machine))
+        await machine.start_master(machine.store or self.store_of(machine))
 
     async def start(self) -> None:
         """Start all members and all masters."""

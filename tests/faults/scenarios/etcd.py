@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ DISK = "200m"
 FAKETIME = "faketime/libfaketime.so.1"
 """In the folder of an architecture's libraries."""
 CLOCKS = ("+1h", "-1h")
+JUMPS = {"+1h": 3600.0, "-1h": -3600.0, "+0": 0.0}
+"""What libfaketime is told, and seconds."""
+NEAR_S = 60.0
+LONG_JUMPS = 5
 _SOURCE = Path(__file__).parent.parent / "slow_fsync.c"
 
 
@@ -60,19 +65,12 @@ async def compact(machines: list[Machine]) -> None:
 
 
 async def clocks(world: World) -> None:
-    """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn.
-
-    Raises:
-        FileNotFoundError: libfaketime is missing; a preloaded library that is missing would change no clock.
-    """
-    faketime = next((str(path) for path in Path("/usr/lib").glob(f"*/{FAKETIME}")), None)
-    if faketime is None:
-        raise FileNotFoundError("libfaketime.so.1 is missing (Debian: faketime)")
+    """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn."""
     for jump in CLOCKS:
         leader = await world.cluster.leader()
         right = [each for each in world.cluster.machines if each is not leader and not each.master_env]
         machine = world.rng.choice(right)
-        machine.master_env = {"LD_PRELOAD": faketime, "FAKETIME": jump, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+        machine.master_env = _wrong_clock(FAKETIME=jump)
         await machine.master.stop()
         await world.whole()
     wrong = [machine for machine in world.cluster.machines if machine.master_env]
@@ -90,6 +88,49 @@ async def clocks(world: World) -> None:
         if machine.master.running:
             await machine.master.kill()
         await world.whole()
+
+
+def _wrong_clock(**how: str) -> dict[str, str]:
+    """Return the environment of a master with another clock.
+
+    Raises:
+        FileNotFoundError: libfaketime is missing; a preloaded library that is missing would change no clock.
+    """
+    faketime = next((str(path) for path in Path("/usr/lib").glob(f"*/{FAKETIME}")), None)
+    if faketime is None:
+        raise FileNotFoundError("libfaketime.so.1 is missing (Debian: faketime)")
+    return {"LD_PRELOAD": faketime, "FAKETIME_DONT_FAKE_MONOTONIC": "1", **how}
+
+
+async def clock_jumps(world: World) -> None:
+    """Set the clocks of all masters ahead and back while they run: leases are timed by another clock."""
+    file = world.cluster.folder / "clock"
+    file.write_text("+0\n")
+    for machine in world.cluster.machines:
+        machine.master_env = _wrong_clock(FAKETIME_TIMESTAMP_FILE=str(file), FAKETIME_NO_CACHE="1")
+        await machine.master.stop()
+        await world.whole()
+    term = (await (await world.cluster.leader()).health())["term"]
+    for jump in list(JUMPS) * (1 if world.scale == 1 else LONG_JUMPS):
+        file.write_text(f"{jump}\n")
+        leader = await world.cluster.leader()
+        shown = await _clock_of(leader)
+        assert abs((shown - time.time()) - JUMPS[jump]) < NEAR_S, f"the clock of {leader.name} did not jump"
+        since = time.monotonic()
+        await world.until_written(f"clocks at {jump}", since)
+        await world.clients.wait_for_writes(10)
+    now = (await (await world.cluster.leader()).health())["term"]
+    assert now == term, f"a clock that jumps ended {now - term} terms"
+    for machine in world.cluster.machines:
+        machine.master_env = {}
+        await machine.master.stop()
+        await world.whole()
+
+
+async def _clock_of(machine: Machine) -> float:
+    """Return the time by the clock of a machine's master, seconds since 1970."""
+    async with aiohttp.ClientSession() as session, session.get(f"{machine.url}healthz") as reply:
+        return parsedate_to_datetime(reply.headers["Date"]).timestamp()
 
 
 async def slow_disk(world: World) -> None:

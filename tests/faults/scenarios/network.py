@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, AsyncExitStack
 
+from faults.answers import losing_proxies
 from faults.machines import CONTROL_PORT, PEER_PORT, Machine
 from faults.networks import dropped, slow, unplugged
 from faults.world import World
@@ -16,6 +17,8 @@ CUT_S = 7.0
 LONG_CUT_S = 12.0
 DELAY_S, LOSS = 0.2, 0.05
 SLOW_S = 8.0
+LOST_SHARE = 0.05
+LOST_WRITES, LONG_LOST_WRITES = 30, 500
 LONG_SLOW_S = 60.0
 
 
@@ -98,3 +101,28 @@ async def delay(world: World) -> None:
         await world.clients.wait_for_writes()
         now = (await (await world.cluster.leader()).health())["term"]
         world.times.add(f"terms begun under {DELAY_S * 1e3:g} ms and {LOSS:.0%}", now - term)
+
+
+async def lose_answers(world: World) -> None:
+    """Lose answers of etcd, with their connections: saves are done, and the masters are not told of it."""
+    cluster = world.cluster
+    async with losing_proxies(cluster.machines, cluster.client.address, world.rng) as proxies:
+        await _restart(world, f"etcd://{','.join(proxies.values())}")
+        for proxy in proxies:
+            proxy.share = LOST_SHARE
+        await world.clients.wait_for_writes(LOST_WRITES if world.scale == 1 else LONG_LOST_WRITES)
+        for proxy in proxies:
+            proxy.share = 0.0
+        since = time.monotonic()
+        await world.until_written("lost answers of etcd", since)
+        await world.whole()
+        assert sum(proxy.lost for proxy in proxies) > 0, "no answer was lost"
+        await _restart(world, "")
+
+
+async def _restart(world: World, store: str) -> None:
+    """Let all masters use another address of the store."""
+    for machine in world.cluster.machines:
+        machine.store = store
+        await machine.master.stop()
+        await world.whole()
