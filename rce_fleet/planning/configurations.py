@@ -59,6 +59,8 @@ class ConfigurationSearch:
         rotations: See :class:`~rce_fleet.planning.planner.PlanningProblem`.
         seed: Of the random numbers.
         turning: For moves with few turns, likewise until the search gets no nearer with it.
+        keeps_weights: Whether weights are more than guidance: they are kept as long as the robots get nearer
+            with them, and not only as long as more and more robots arrive.
     """
 
     def __init__(
@@ -70,7 +72,9 @@ class ConfigurationSearch:
         rotations: bool,
         seed: int,
         turning: Turning | None = None,
+        keeps_weights: bool = False,
     ) -> None:
+        self._keeps_weights, self._least = keeps_weights, -1
         self._graph, self._goals = graph, goals
         self._table = table
         given = turning or Turning.none(len(goals))
@@ -196,6 +200,10 @@ class ConfigurationSearch:
         fewest = int(away.sum(axis=1).min())
         self._since = 0 if fewest < self._fewest else self._since + count
         self._fewest = min(fewest, self._fewest)
+        if self._keeps_weights:
+            least = int(self._away(self._rows[1 : count + 1]).sum(axis=1).min())
+            if self._least < 0 or least < self._least:
+                self._least, self._since = least, 0
         if self._since < _PATIENCE:
             return
         self._since = 0

@@ -226,6 +226,7 @@ def _search(
         rotations=problem.rotations,
         seed=seed,
         turning=turning,
+        keeps_weights=not problem.is_unweighted,
     )
     rounds = (effort or problem.effort) // len(part.starts)
     cells, complete = search.run(part.starts, rounds, problem.urgency)

@@ -191,3 +191,21 @@ def test_the_lanes_of_the_page_can_be_driven(tmp_path: Path) -> None:
     cells = sorted(lanes.cells)
     assert len(cells) == 16
     assert (distance_fields(lanes.graph(grid), cells)[:, cells] < UNREACHABLE).all()
+
+
+def test_long_ways_follow_fast_lanes_to_their_end() -> None:
+    """After many steps too, in which no robot arrives."""
+    grid = GridMap(2, 200)
+    way, slow = tuple(range(101)), tuple(range(100, 200))
+    around = (100, *range(300, 400), 199)
+    lanes = LaneGraph(
+        (
+            Lane("way", way, speed=1.0),
+            Lane("slow", slow, speed=0.1),
+            Lane("around", around, speed=1.0),
+        )
+    )
+    problem = PlanningProblem.of(lanes.graph(grid), starts=[0], goals=[199])
+    joint = load_planner("lacam").plan(problem)
+    assert joint.complete
+    assert problem.extra_cost(joint.cells) == 0
