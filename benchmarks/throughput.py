@@ -30,6 +30,7 @@ _PLAIN = FleetSettings(robot_radius=ROBOT_RADIUS)
 CHOICES = {
     "paths as planned": _PLAIN,
     "better paths": replace(_PLAIN, improve_seconds=inf),
+    "better paths, with turns": replace(_PLAIN, improve_seconds=inf, quarter_turn=0.8, stop=0.4),
 }
 
 

@@ -41,8 +41,10 @@ FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
     "columns": 8,
     "cell_size": 1.0,
     "walls": [9, 20, 21, 23, 37, 41, 42, 45, 50],
+    "quarter_turn": 0.9,
+    "stop": 0.64,
 }
-"""The planner's parameters for the floor of ``configs/scene.yaml``."""
+"""The planner's parameters for the floor of ``configs/scene.yaml`` and its robots, which drive 0.8 m/s."""
 
 _POSE = "geometry_msgs/PoseWithCovarianceStamped"
 _BATTERY = "sensor_msgs/BatteryState"

@@ -15,6 +15,7 @@ from rce_fleet.coordination.rerouting import (
     Rerouting,
     adopt_rerouting,
     copied_robots,
+    motion_of,
     paths_as_tuples,
     weighted_graph,
 )
@@ -65,13 +66,18 @@ class Improving:
         self._versions = {robot: self._state.ledger.version(robot) for robot in request.robots}
         self._map_version = self._state.map_version
 
-    def take(self, request: PlanRequest, found: Rerouting) -> None:
-        """Enter better paths into the ledger, unless the state has changed since the request."""
+    def take(self, request: PlanRequest, found: Rerouting) -> set[str]:
+        """Enter better paths into the ledger, unless the state has changed since the request.
+
+        Returns:
+            Robots that need new paths: zones do not allow all of theirs.
+        """
         holds = self._holds(request, found)
         # After a gain there may be more to gain; what was found for another state is looked for again.
         self.is_due = bool(found.robots) or not holds
-        if found.robots and holds:
-            adopt_rerouting(self._state, request, found, self._versions)
+        if not found.robots or not holds:
+            return set()
+        return adopt_rerouting(self._state, request, found, self._versions)
 
     def _holds(self, request: PlanRequest, found: Rerouting) -> bool:
         """Return whether cells, paths, and goals of robots with better paths are still those of the copy."""
@@ -107,6 +113,7 @@ def compute_improvement(request: PlanRequest) -> Rerouting:
         seed=request.seed,
         forbidden={index: frozenset(cells) for index, cells in request.forbidden} or None,
         own_costs=own_costs,
+        motion=motion_of(request),
         urgent=[index for index, urgency in enumerate(request.urgency) if urgency >= MOST_URGENT],
     )
     return Rerouting(True, tuple(found.paths), paths_as_tuples(found.paths))

@@ -15,6 +15,8 @@ from itertools import islice
 from math import inf
 from typing import TYPE_CHECKING
 
+from rce_fleet.planning.motion import direction_of
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
@@ -30,6 +32,21 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
+class Turns:
+    """What turns cost a robot.
+
+    Attributes:
+        facing: Its heading at the end of its granted cells, see :mod:`rce_fleet.planning.motion`.
+        columns: Columns of the grid.
+        steps: Steps of turning from each heading to each direction.
+    """
+
+    facing: int
+    columns: int
+    steps: Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
 class Roads:
     """Where a robot may drive.
 
@@ -40,6 +57,7 @@ class Roads:
         costs: Steps that entering a cell takes, where it is not 1.
         goals: Cells that robots are sent to: none of them steps aside into one.
         move_costs: Steps that moves ``(from, to)`` take, where it is not 1.
+        turns: What its turns cost; None: nothing.
     """
 
     neighbours: Sequence[Sequence[int]]
@@ -48,6 +66,7 @@ class Roads:
     costs: Mapping[int, int]
     goals: frozenset[int]
     move_costs: Mapping[tuple[int, int], int]
+    turns: Turns | None = None
 
     def cost(self, start: int, end: int) -> int:
         """Return how many steps a move takes."""
@@ -121,20 +140,25 @@ class _Search:
         self._parents: list[int] = []
         self.times: list[float] = []
         self._heap: list[tuple[float, float, int]] = []
-        self._best: dict[tuple[int, float], float] = {}
+        self._headings: list[int] = []
+        self._best: dict[tuple[int, float, int], float] = {}
         old = ledger.horizon(robot)
         self.tried = len(old)
+        before, heading = -1, 0 if roads.turns is None else roads.turns.facing
         for cell, step in old:
+            heading = heading if before < 0 else self._heading(before, cell)
+            before = cell
             until = min((enters for enters, _ in ledger.occupied(cell, robot) if enters > step), default=inf)
             is_alone = len(old) == 1 and max(step, ledger.clock) + 1.0 < until
-            self._add(cell, until, max(step, ledger.clock) if is_alone else step, self._rest(cell), -1)
+            at = max(step, ledger.clock) if is_alone else step
+            self._add(cell, until, heading, at, self._rest(cell), -1)
         self.seeds = len(old)
 
     def take(self) -> int | None:
         """Return the most promising node that was not reached earlier by another way; None without one."""
         while self._heap:
             _, early, node = heappop(self._heap)
-            if -early <= self._best[self.cells[node], self.untils[node]]:
+            if -early <= self._best[self.cells[node], self.untils[node], self._headings[node]]:
                 return node
         return None
 
@@ -149,6 +173,9 @@ class _Search:
             if rest >= FAR:
                 continue
             pace: float = roads.cost(cell, other) if roads.move_costs else roads.costs.get(other, 1)
+            heading = self._heading(cell, other)
+            if roads.turns is not None:
+                pace += roads.turns.steps[self._headings[node]][heading]
             if node < self.seeds:
                 pace = min(pace, (until - time) / 2)  # It may have to give way at once.
             for after, before in self._known.from_step(other, time):
@@ -156,14 +183,30 @@ class _Search:
                 if after >= until:
                     break
                 at = max(time + pace, after + min(0.5, (before - after) / 2) if after > -inf else -inf)
-                if at < min(before, until, self._best.get((other, before), inf)):
-                    self._add(other, before, at, rest, node)
+                if at < min(before, until) and not self._is_reached(other, before, heading, at):
+                    self._add(other, before, heading, at, rest, node)
+
+    def _heading(self, cell: int, other: int) -> int:
+        """Return the direction of a move; always the same one where turns cost nothing."""
+        turns = self._roads.turns
+        return 0 if turns is None else direction_of(other - cell, turns.columns)
+
+    def _is_reached(self, cell: int, until: float, heading: int, at: float) -> bool:
+        """Return whether a robot can be in a cell, and have turned to a heading, as early by another way."""
+        turns = self._roads.turns
+        if turns is None:
+            return self._best.get((cell, until, heading), inf) <= at
+        return any(
+            self._best.get((cell, until, other), inf) + row[heading] <= at
+            for other, row in enumerate(turns.steps)
+        )
 
     def _rest(self, cell: int) -> int:
         return 0 if self._field is None else self._field[cell]
 
-    def _add(self, cell: int, until: float, at: float, rest: int, parent: int) -> None:
-        self._best[cell, until] = at
+    def _add(self, cell: int, until: float, heading: int, at: float, rest: int, parent: int) -> None:
+        self._best[cell, until, heading] = at
+        self._headings.append(heading)
         heappush(self._heap, (at + rest, -at, len(self.cells)))
         self.cells.append(cell)
         self.untils.append(until)

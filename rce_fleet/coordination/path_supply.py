@@ -47,7 +47,7 @@ class PathSupply:
         self.outdated = False
         self.concerned: set[str] = set()
         self._partial = False
-        self._repair = PathRepair(state)
+        self._repair = PathRepair(state, settings)
         self._guard = StarvationGuard(state, settings)
         self._improving = Improving(state, settings)
         self._is_alone = settings.planner == INDEPENDENT
@@ -90,7 +90,7 @@ class PathSupply:
         if result.rerouting is not None:
             self._asked = None
             if request.improve_seconds:
-                self._improving.take(request, result.rerouting)
+                self.concerned |= self._improving.take(request, result.rerouting)
             elif result.rerouting.found:
                 self._improving.is_due = True
                 self.concerned |= adopt_rerouting(self._state, request, result.rerouting, self._versions)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.path_search import FAR, Roads, costs_to, find_path, is_enclosed, moves_to
+from rce_fleet.coordination.path_search import FAR, Roads, Turns, costs_to, find_path, is_enclosed, moves_to
+from rce_fleet.coordination.rerouting import heading_at_start
 from rce_fleet.coordination.robot import Phase
+from rce_fleet.planning.motion import Motion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.robot import RobotRecord
+    from rce_fleet.coordination.settings import FleetSettings
 
 _FIELDS = 256
 """Distances to so many goals are kept while the map does not change."""
@@ -22,10 +25,13 @@ class PathRepair:
 
     Args:
         state: The fleet; its ledger and the robots' ``unreachable`` are changed.
+        settings: What turns and stops cost.
     """
 
-    def __init__(self, state: FleetState) -> None:
+    def __init__(self, state: FleetState, settings: FleetSettings) -> None:
         self._state = state
+        motion = Motion(settings.quarter_turn, settings.stop)
+        self._turn_steps = motion.turn_steps.tolist() if motion.turn_steps.any() else None
         self._version = -1
         self._fields: dict[tuple[int, frozenset[int], frozenset[tuple[int, int]]], list[int]] = {}
 
@@ -147,7 +153,13 @@ class PathRepair:
             state.zones.costs_of(robot),
             frozenset(state.index.goals),
             state.zones.move_costs,
+            self._turns(robot),
         )
+
+    def _turns(self, robot: str) -> Turns | None:
+        if self._turn_steps is None:
+            return None
+        return Turns(heading_at_start(self._state, robot), self._state.grid.columns, self._turn_steps)
 
     def _field(self, goal: int, robot: str, forbidden: frozenset[int]) -> list[int]:
         """Return the number of moves to a goal from each cell, without regard to robots."""

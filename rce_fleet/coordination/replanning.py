@@ -8,7 +8,6 @@ the result into the ledger, as far as the robots are still where the plan begins
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +19,8 @@ from rce_fleet.coordination.rerouting import (
     Rerouting,
     compute_rerouting,
     copy_ledger,
+    heading_at_start,
+    motion_of,
     weighted_graph,
 )
 from rce_fleet.coordination.robot import Phase
@@ -28,7 +29,6 @@ from rce_fleet.coordination.targets import assign_targets
 from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.motion import Motion, heading_of
 from rce_fleet.planning.planner import DEFAULT_PLANNER, PlanningProblem, load_planner
 from rce_fleet.planning.straightening import ends_of
 
@@ -39,8 +39,9 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.settings import FleetSettings
     from rce_fleet.planning.planner import Planner
 
-MOVE = 2
-"""Cells of a move."""
+
+MOST_TURNING = 100
+"""Robots up to which a plan for all counts turns: for 1000 it would take seconds. Better paths count them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +180,11 @@ def request_plan(
         own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
         own_closed=_own_closed(state, robots),
-        headings=tuple(_heading(state, robot) for robot in robots) if for_all else (),
+        headings=(
+            tuple(heading_at_start(state, robot) for robot in robots)
+            if settings.quarter_turn or settings.stop
+            else ()
+        ),
         quarter_turn=settings.quarter_turn,
         stop=settings.stop,
         urgency=(
@@ -190,15 +195,6 @@ def request_plan(
         copy=None if for_all else copy_ledger(state, robots, members),
         improve_seconds=settings.improve_seconds if improve else 0.0,
     )
-
-
-def _heading(state: FleetState, robot: str) -> int:
-    """Return the heading that a robot has at the end of its granted cells."""
-    granted, grid = state.ledger.granted(robot), state.grid
-    if len(granted) < MOVE:
-        return heading_of(state.robots[robot].yaw - grid.yaw)
-    (row, column), (row_before, column_before) = grid.place(granted[-1]), grid.place(granted[-2])
-    return heading_of(atan2(row - row_before, column - column_before))
 
 
 def _own_costs(
@@ -285,11 +281,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         seed=request.seed,
         effort=request.effort,
         forbidden=forbidden or None,
-        motion=(
-            Motion(request.quarter_turn, request.stop, request.headings)
-            if request.quarter_turn or request.stop
-            else None
-        ),
+        motion=motion_of(request) if len(request.robots) <= MOST_TURNING else None,
         urgency=request.urgency or None,
         lifelong=True,
         own_costs=own_costs,

@@ -20,6 +20,7 @@ from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import move_costs
+from rce_fleet.planning.motion import Motion, direction_of, heading_of
 from rce_fleet.planning.rerouting import RoutedRobots, reroute
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ NO_CELL = -1
 """In a request: the robot has no such cell."""
 CLOSED = 10_000
 """Cost of a move that a robot may not make: more than any way around."""
+_MOVE = 2
+"""Cells of a move."""
 _MOST_EFFORT = 150_000
 """Work after which a plan for all is made instead: it takes no longer."""
 
@@ -116,7 +119,11 @@ def copy_ledger(state: FleetState, robots: Sequence[str], members: Sequence[str]
 
 
 def compute_rerouting(request: PlanRequest) -> Rerouting:
-    """Return new paths for the members of the request's copy; the same request gives the same paths."""
+    """Return new paths for the members of the request's copy; the same request gives the same paths.
+
+    Turns are not counted: with them searches are so much longer that in dense traffic they find nothing in
+    the time that everyone waits for. Searches for better paths follow, which count them.
+    """
     copy = request.copy
     assert copy is not None
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
@@ -160,6 +167,22 @@ def paths_as_tuples(
 ) -> tuple[tuple[tuple[int, float], ...], ...]:
     """Return cells and steps of each path, in the order of the robots."""
     return tuple(tuple(zip(cells.tolist(), at.tolist(), strict=True)) for cells, at in paths.values())
+
+
+def heading_at_start(state: FleetState, robot: str) -> int:
+    """Return the heading that a robot has at the end of its granted cells, where its new path begins."""
+    account, columns = state.ledger.account(robot), state.grid.columns
+    if account.granted < _MOVE:
+        return heading_of(state.robots[robot].yaw - state.grid.yaw)
+    before, last = account.route[account.granted - _MOVE : account.granted]
+    return direction_of(last - before, columns)
+
+
+def motion_of(request: PlanRequest) -> Motion | None:
+    """Return what turns and stops cost the robots of a request; None: nothing."""
+    if not request.quarter_turn and not request.stop:
+        return None
+    return Motion(request.quarter_turn, request.stop, request.headings)
 
 
 def weighted_graph(

@@ -12,6 +12,8 @@ from rce_fleet.demo.resources import LOOPBACK, Ports
 from rce_fleet.demo.worlds import NamedWorld
 from rce_fleet.drivers.scene import scene_of
 from rce_fleet.maps.ros_map import save_map
+from rce_fleet.navigation.navigation import DriveLimits
+from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.wiring import FleetAccount
 
@@ -24,6 +26,18 @@ JOIN_TOGETHER = 100
 PARK_AFTER_PER_ROBOT = 0.4
 """Seconds for each robot of a large fleet before idle ones park. The planner does not know where robots stand
 that have not joined yet, so the others must not drive before."""
+
+
+def motion_on(cell_size: float) -> Motion:
+    """Return what turns and stops cost the demo's robots on cells of a size, metres."""
+    limits = DriveLimits()
+    return Motion.of_robot(
+        cell_size=cell_size,
+        speed=limits.speed,
+        turn_rate=limits.turn_rate,
+        acceleration=limits.acceleration,
+        turn_acceleration=limits.turn_acceleration,
+    )
 
 
 class Mode(StrEnum):
@@ -161,7 +175,9 @@ class DemoConfig:
         walls = [] if self.slam else sorted(grid.blocked)
         cells = {"walls": walls, "blocked": list(scenario.known_boxes)}
         known = {name: value for name, value in cells.items() if value}
-        return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **known}
+        motion = motion_on(grid.cell_size)
+        turns = {"quarter_turn": round(motion.quarter_turn, 2), "stop": round(motion.stop, 2)}
+        return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **turns, **known}
 
     @property
     def chargers(self) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ to the next one costs the move and the turn between them. So the distance fields
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import floor, inf, isfinite, pi
+from math import floor, inf, isfinite, pi, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,22 +75,28 @@ class Motion:
         speed: float,
         turn_rate: float,
         acceleration: float = inf,
+        turn_acceleration: float = inf,
         headings: tuple[int, ...] = (),
     ) -> Motion:
         """Return the motion of a differential drive.
 
         A robot that brakes from the speed v to a stop and starts again, both with the acceleration a, needs
-        v / a longer than one that drives through.
+        v / a longer than one that drives through. A turn begins and ends at rest.
 
         Args:
             cell_size: Distance of two cells, metres.
             speed: Of driving straight, metres per second.
             turn_rate: Of turning on the spot, radians per second.
             acceleration: Metres per second squared.
+            turn_acceleration: Radians per second squared.
             headings: See the class.
         """
-        step = cell_size / speed
-        return cls(pi / 2 / turn_rate / step, speed / acceleration / step, headings)
+        step, quarter = cell_size / speed, pi / 2
+        if turn_rate**2 < quarter * turn_acceleration:
+            turn = quarter / turn_rate + turn_rate / turn_acceleration
+        else:  # It brakes before it has its highest rate.
+            turn = 2 * sqrt(quarter / turn_acceleration)
+        return cls(turn / step, speed / acceleration / step, headings)
 
     def heading(self, robot: int) -> int:
         """Return the heading of a robot at its start."""
@@ -99,8 +105,12 @@ class Motion:
     @property
     def costs(self) -> Ints:
         """Cost of turning from each heading to each direction, units, shape (5, 4), with a stop each."""
-        steps = QUARTERS * self.quarter_turn + (QUARTERS > 0) * self.stop
-        return np.asarray(np.minimum(np.rint(steps * UNITS), MAX_COST // 4), dtype=np.int32)
+        return np.asarray(np.minimum(np.rint(self.turn_steps * UNITS), MAX_COST // 4), dtype=np.int32)
+
+    @property
+    def turn_steps(self) -> NDArray[np.float64]:
+        """Steps of turning from each heading to each direction, shape (5, 4), with a stop each."""
+        return QUARTERS * self.quarter_turn + (QUARTERS > 0) * self.stop
 
 
 def heading_of(yaw: float) -> int:
@@ -108,6 +118,15 @@ def heading_of(yaw: float) -> int:
     if not isfinite(yaw):
         return UNKNOWN
     return _COUNTER_CLOCKWISE[floor(yaw / (pi / 2) + 0.5) % 4]
+
+
+def direction_of(offset: int, columns: int) -> int:
+    """Return the direction of a move to the cell beside with a number greater by ``offset``."""
+    if offset == columns:
+        return UP
+    if offset == -columns:
+        return DOWN
+    return RIGHT if offset == 1 else LEFT
 
 
 def edge_directions(graph: PlanningGraph) -> Ints:
@@ -123,6 +142,27 @@ def edge_directions(graph: PlanningGraph) -> Ints:
         [offsets == graph.columns, offsets == -graph.columns, offsets == 1], [UP, DOWN, RIGHT], LEFT
     )
     return found.astype(np.int32)
+
+
+def turns_on(
+    graph: PlanningGraph, motion: Motion | None, robots: int
+) -> tuple[Ints, NDArray[np.float64], Ints]:
+    """Return what a search with turns needs; without a motion, turns cost nothing.
+
+    Args:
+        graph: Where robots drive.
+        motion: What turns cost.
+        robots: Number of robots.
+
+    Returns:
+        Direction of each edge; steps of turning from each heading to each direction, shape (5, 4); heading of
+        each robot.
+    """
+    if motion is None or not motion.turn_steps.any():
+        none = np.zeros(len(graph.neighbours), np.int32)
+        return none, np.zeros((UNKNOWN + 1, 4)), np.full(robots, UNKNOWN, np.int32)
+    headings = np.array([motion.heading(robot) for robot in range(robots)], np.int32)
+    return edge_directions(graph), motion.turn_steps.astype(np.float64), headings
 
 
 @dataclass(frozen=True, eq=False)

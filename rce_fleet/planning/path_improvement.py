@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.planning.motion import turns_on
 from rce_fleet.planning.path_improvement_loops import improve_paths
 from rce_fleet.planning.rerouting import closed_rows, cost_rows, routes_begin
 from rce_fleet.planning.visit_lists import fill_lists, list_visits
+from rce_fleet.planning.visit_search import HEADINGS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.planning.graph import PlanningGraph
+    from rce_fleet.planning.motion import Motion
     from rce_fleet.planning.rerouting import RoutedRobots
 
     Ints = NDArray[np.int32]
@@ -65,6 +68,7 @@ def improved(
     seed: int = 0,
     forbidden: Mapping[int, frozenset[int]] | None = None,
     own_costs: Mapping[int, Ints] | None = None,
+    motion: Motion | None = None,
     urgent: Collection[int] = (),
 ) -> ImprovedPaths:
     """Return paths with which robots arrive earlier in all, among the paths of the others.
@@ -80,6 +84,7 @@ def improved(
         seed: Of the random numbers.
         forbidden: Nodes that single robots must not enter.
         own_costs: Costs of all edges for single robots; those with the same costs share one array.
+        motion: What turns cost, on a grid, with the heading of each robot at its start; None: nothing.
         urgent: Robots that must not arrive later than before for the sake of others.
     """
     deadline = perf_counter() + seconds
@@ -104,17 +109,18 @@ def improved(
     is_urgent[list(urgent)] = 1
     closed_at, closed = closed_rows(forbidden, count)
     costs_at, costs = cost_rows(graph, count, own_costs or {})
+    directions, turns, headings = turns_on(graph, motion, count)
     fields, is_known = np.empty((count, size), np.int32), np.zeros(count, np.int32)
-    best = np.empty((size, times.shape[1] + 1))
-    marks = np.zeros(best.shape, np.int32)
+    best = np.empty((size, times.shape[1] + 1, HEADINGS))
+    marks = np.zeros(best.shape[:2], np.int32)
     state, random = np.zeros(3, np.int64), np.array([(seed * 2654435761 + 53) & 0x7FFFFFFF], np.int64)
     gain, tries, in_vain = 0.0, 1, _IN_VAIN * int(is_free.sum()) + _IN_VAIN_AT_LEAST
     while state[1] < effort and state[2] < in_vain and (began := perf_counter()) < deadline:
         gain += improve_paths(
             graph.indptr, graph.neighbours, costs_at, costs, graph.reverse.indptr, graph.reverse.neighbours,
-            robots.starts, robots.begins, robots.goals, closed_at, closed, robots.clock, is_free, is_urgent,
-            tries, effort, counts, times, tags, lengths, nodes, steps, fields, is_known, is_goal, best, marks,
-            state, is_changed, random,
+            directions, turns, robots.starts, headings, robots.begins, robots.goals, closed_at, closed,
+            robots.clock, is_free, is_urgent, tries, effort, counts, times, tags, lengths, nodes, steps,
+            fields, is_known, is_goal, best, marks, state, is_changed, random,
         )  # fmt: skip
         tries = min(2 * tries, 64) if perf_counter() - began < _LOOK else max(tries // 2, 1)
     paths = {

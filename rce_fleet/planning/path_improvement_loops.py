@@ -12,7 +12,7 @@ import numpy as np
 
 from rce_fleet.compiled import helper, kernel
 from rce_fleet.planning.swap import draw
-from rce_fleet.planning.visit_search import search_path, write_distances
+from rce_fleet.planning.visit_search import STATE, search_path, write_distances
 from rce_fleet.planning.visits import DWELL, ENTER, LEAVE, ROBOT, cut_path, enter_path, place_of
 
 if TYPE_CHECKING:
@@ -110,7 +110,10 @@ def _improve_paths(
     costs: Ints,
     back_indptr: Ints,
     back_neighbours: Ints,
+    directions: Ints,
+    turns: Floats,
     starts: Ints,
+    headings: Ints,
     begins: Floats,
     goals: Ints,
     closed_at: Ints,
@@ -144,7 +147,10 @@ def _improve_paths(
         costs: Steps that each edge takes at least, shape (rows, edges).
         back_indptr: The graph with reversed edges.
         back_neighbours: The graph with reversed edges.
+        directions: Direction of each edge, shape (edges,).
+        turns: Steps of turning from each heading to each direction, shape (5, 4).
         starts: Node of each robot, shape (robots,).
+        headings: Heading of each robot there, shape (robots,).
         begins: Step at which it entered it, shape (robots,).
         goals: Goal of each robot, or -1, shape (robots,).
         closed_at: Where the closed nodes of each robot begin, shape (robots + 1,).
@@ -163,8 +169,8 @@ def _improve_paths(
         fields: Distances to the goals, shape (robots, nodes); written where they are needed.
         is_known: Whether a robot's are written, shape (robots,); changed.
         is_goal: Whether a node is a robot's goal, shape (nodes,).
-        best: Scratch, shape (nodes, room + 1).
-        marks: Scratch of the same shape, zeros at first.
+        best: Scratch, shape (nodes, room + 1, 5).
+        marks: Scratch, shape (nodes, room + 1), zeros at first.
         state: Number of the last search, states so far, groups in vain since the last gain; changed.
         is_changed: Set to 1 for robots with another path, shape (robots,).
         random: State of the random numbers.
@@ -174,7 +180,7 @@ def _improve_paths(
     """
     robots, longest = nodes.shape
     scratch = np.empty(len(counts), np.int32)
-    states = np.empty((STATES, 3), np.int32)
+    states = np.empty((STATES, STATE), np.int32)
     scores = np.empty((STATES, 2))
     heap = np.empty(STATES, np.int32)
     members = np.empty(GROUP, np.int32)
@@ -257,9 +263,9 @@ def _improve_paths(
                 state[0] += 1
                 work[0] = 0
                 length = search_path(
-                    indptr, neighbours, costs[costs_at[robot]], fields[robot], start, begin, own, goal, DWELL,
-                    is_goal, _GIVE_UP, counts, times, tags, best, marks, state[0], states, scores, heap, work,
-                    nodes[robot], steps[robot],
+                    indptr, neighbours, costs[costs_at[robot]], directions, turns, fields[robot], start,
+                    headings[robot], begin, own, goal, DWELL, is_goal, _GIVE_UP, counts, times, tags, best,
+                    marks, state[0], states, scores, heap, work, nodes[robot], steps[robot],
                 )  # fmt: skip
                 state[1] += work[0]
             if length < 1:
@@ -306,9 +312,10 @@ def _improve_paths(
 
 
 _ROW, _TABLE, _FLOATS, _LONG = "int32[::1]", "int32[:, ::1]", "float64[::1]", "int64[::1]"
+_GRAPHS = ", ".join([_ROW] * 3 + [_TABLE] + [_ROW] * 3 + ["float64[:, ::1]"])
+_ROBOTS = f"{_ROW}, {_ROW}, {_FLOATS}, {_ROW}, {_ROW}, {_ROW}, float64, {_ROW}, {_ROW}, int64, int64"
+_LISTS = f"{_ROW}, float64[:, :, ::1], int32[:, :, ::1]"
+_PATHS = f"{_ROW}, {_TABLE}, float64[:, ::1], {_TABLE}, {_ROW}, {_ROW}, float64[:, :, ::1], {_TABLE}"
 improve_paths = kernel(
-    f"float64({_ROW}, {_ROW}, {_ROW}, {_TABLE}, {_ROW}, {_ROW}, {_ROW}, {_FLOATS}, {_ROW}, {_ROW}, {_ROW}, "
-    f"float64, {_ROW}, {_ROW}, int64, int64, {_ROW}, float64[:, :, ::1], int32[:, :, ::1], {_ROW}, {_TABLE}, "
-    f"float64[:, ::1], {_TABLE}, {_ROW}, {_ROW}, float64[:, ::1], {_TABLE}, {_LONG}, {_ROW}, {_LONG})",
-    numpy=_improve_paths,
+    f"float64({_GRAPHS}, {_ROBOTS}, {_LISTS}, {_PATHS}, {_LONG}, {_ROW}, {_LONG})", numpy=_improve_paths
 )(_improve_paths)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.planning.motion import turns_on
 from rce_fleet.planning.rerouting_loops import PLANNED, reroute_robots
 from rce_fleet.planning.visit_lists import fill_lists, list_visits
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.planning.graph import PlanningGraph
+    from rce_fleet.planning.motion import Motion
 
     Ints = NDArray[np.int32]
     Floats = NDArray[np.float64]
@@ -80,6 +82,7 @@ def reroute(
     seed: int = 0,
     forbidden: Mapping[int, frozenset[int]] | None = None,
     own_costs: Mapping[int, Ints] | None = None,
+    motion: Motion | None = None,
 ) -> Rerouted | None:
     """Return new paths of ``members``, and of robots in their way.
 
@@ -91,6 +94,7 @@ def reroute(
         seed: Breaks ties.
         forbidden: Nodes that single robots must not enter.
         own_costs: Costs of all edges for single robots; those with the same costs share one array.
+        motion: What turns cost, on a grid, with the heading of each robot at its start; None: nothing.
 
     Returns:
         The new paths; None if not all of them were found.
@@ -102,6 +106,7 @@ def reroute(
     )
     closed_at, closed = closed_rows(forbidden, count)
     costs_at, costs = cost_rows(graph, count, own_costs or {})
+    directions, turns, headings = turns_on(graph, motion, count)
     touched = len(members) + TOUCHED
     slots, lengths = np.full(count, -1, np.int32), np.full(touched, PLANNED, np.int32)
     nodes, steps = np.empty((touched, LONGEST), np.int32), np.empty((touched, LONGEST))
@@ -109,7 +114,7 @@ def reroute(
     targets = np.where(robots.goals >= 0, robots.goals, np.where(is_free, robots.rests, -1)).astype(np.int32)
     done = reroute_robots(
         graph.indptr, graph.neighbours, costs_at, costs, graph.reverse.indptr, graph.reverse.neighbours,
-        robots.starts, robots.begins, robots.goals, targets, closed_at, closed,
+        directions, turns, robots.starts, headings, robots.begins, robots.goals, targets, closed_at, closed,
         routes_at, robots.nodes, robots.steps, robots.clock, effort, np.array(members, np.int32),
         counts, times, tags, slots, lengths, nodes, steps, np.array([seed + 1], np.int64),
     )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 
 from rce_fleet.compiled import helper, kernel
 from rce_fleet.planning.swap import draw
-from rce_fleet.planning.visit_search import search_path, write_distances
+from rce_fleet.planning.visit_search import HEADINGS, STATE, search_path, write_distances
 from rce_fleet.planning.visits import (
     DWELL,
     ENTER,
@@ -158,7 +158,10 @@ def _reroute(
     costs: Ints,
     back_indptr: Ints,
     back_neighbours: Ints,
+    directions: Ints,
+    turns_to: Floats,
     starts: Ints,
+    headings: Ints,
     begins: Floats,
     goals: Ints,
     targets: Ints,
@@ -188,7 +191,10 @@ def _reroute(
         costs: Steps that each edge takes at least, shape (rows, edges).
         back_indptr: The graph with reversed edges.
         back_neighbours: The graph with reversed edges.
+        directions: Direction of each edge, shape (edges,).
+        turns_to: Steps of turning from each heading to each direction, shape (5, 4).
         starts: Node of each robot, shape (robots,).
+        headings: Heading of each robot there, shape (robots,).
         begins: Step at which it entered it, shape (robots,).
         goals: Goal of each robot, or -1, shape (robots,).
         targets: Its goal or its place of rest, or -1; those that cannot be reached become -1.
@@ -216,9 +222,9 @@ def _reroute(
     touched = len(nodes)
     fields = np.empty((touched, size), np.int32)
     scratch = np.empty(size, np.int32)
-    best = np.empty((size, room + 1))
+    best = np.empty((size, room + 1, HEADINGS))
     marks = np.zeros((size, room + 1), np.int32)
-    states = np.empty((_STATES, 3), np.int32)
+    states = np.empty((_STATES, STATE), np.int32)
     scores = np.empty((_STATES, 2))
     heap = np.empty(_STATES, np.int32)
     turns = np.zeros(touched, np.int32)
@@ -275,9 +281,9 @@ def _reroute(
             dwell = DWELL if goal >= 0 and target == goal else np.inf
             most = min(_GIVE_UP, effort - work[0])
             length = search_path(
-                indptr, neighbours, costs[costs_at[robot]], fields[slot], start, begin, own, target, dwell,
-                is_goal, most, counts, times, tags, best, marks, mark, states, scores, heap, work,
-                nodes[slot], steps[slot],
+                indptr, neighbours, costs[costs_at[robot]], directions, turns_to, fields[slot], start,
+                headings[robot], begin, own, target, dwell, is_goal, most, counts, times, tags, best, marks,
+                mark, states, scores, heap, work, nodes[slot], steps[slot],
             )  # fmt: skip
         if length >= 0:
             lengths[slot] = length
@@ -326,8 +332,8 @@ def _reroute(
 
 _ROW, _TABLE, _TIMES = "int32[::1]", "int32[:, ::1]", "float64[::1]"
 _GRAPHS, _ROBOTS = (
-    ", ".join([_ROW] * 3 + [_TABLE] + [_ROW] * 2),
-    f"{_ROW}, {_TIMES}, {_ROW}, {_ROW}, {_ROW}, {_ROW}",
+    ", ".join([_ROW] * 3 + [_TABLE] + [_ROW] * 3 + ["float64[:, ::1]"]),
+    f"{_ROW}, {_ROW}, {_TIMES}, {_ROW}, {_ROW}, {_ROW}, {_ROW}",
 )
 _SEARCH = f"float64, int64, {_ROW}"
 _LISTS = f"{_ROW}, float64[:, :, ::1], int32[:, :, ::1]"

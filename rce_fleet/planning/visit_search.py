@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 _WEIGHT = 1.25
 """A path takes at most so many times the steps of the shortest one that is possible; this is found sooner."""
-CELL, PLACE, PARENT = 0, 1, 2
-"""Columns of a state of the search: node, number of its interval, state before it."""
+CELL, PLACE, PARENT, FACING = 0, 1, 2, 3
+"""Columns of a state of the search: node, number of its interval, state before it, heading."""
+STATE, HEADINGS = 4, 5
+"""Columns of a state; headings, with the unknown one (see ``motion``)."""
 
 
 @helper
@@ -118,12 +120,24 @@ def _pop(size: int, heap: Ints, scores: Floats) -> int:
 
 
 @helper
+def _is_reached(arrival: float, heading: int, best: Floats, turns: Floats) -> bool:
+    """Return whether a robot can be in a node, and have turned to a heading, as early by another way."""
+    for other in range(4):
+        if best[other] + turns[other, heading] <= arrival:
+            return True
+    return bool(best[4] <= arrival)
+
+
+@helper
 def search_path(
     indptr: Ints,
     neighbours: Ints,
     costs: Ints,
+    directions: Ints,
+    turns: Floats,
     field: Ints,
     start: int,
+    facing: int,
     begin: float,
     own: int,
     goal: int,
@@ -149,8 +163,11 @@ def search_path(
         indptr: The graph.
         neighbours: The graph.
         costs: Steps that each edge takes at least.
+        directions: Direction of each edge.
+        turns: Steps of turning from each heading to each direction, shape (5, 4).
         field: Distance to the goal, shape (nodes,); zeros without a goal.
         start: Node in which the robot is.
+        facing: Its heading.
         begin: Earliest step at which it leaves.
         own: Place of its visit of ``start``.
         goal: Node where the path ends; -1: any node that no robot has as goal and none enters later.
@@ -160,19 +177,20 @@ def search_path(
         counts: Number of each node's visits, shape (nodes,).
         times: Steps of entering and leaving, shape (nodes, visits, 2).
         tags: Robot and next node of each visit, shape (nodes, visits, 2).
-        best: Scratch, shape (nodes, visits + 1): earliest arrival in each interval.
-        marks: Scratch of the same shape: search that ``best`` is of.
+        best: Scratch, shape (nodes, visits + 1, 5): earliest arrival in each interval, by heading.
+        marks: Scratch, shape (nodes, visits + 1): search that ``best`` is of.
         mark: Number of this search.
-        states: Scratch, shape (states, 3): node, interval, state before.
+        states: Scratch, shape (states, 4): node, interval, state before, heading.
         scores: Scratch, shape (states, 2): arrival, arrival with what is left.
         heap: Scratch, shape (states,).
         work: The number of expanded states is added to it, shape (1,).
         nodes: Nodes to enter; written.
         steps: When to enter them; written.
     """
-    states[0, CELL], states[0, PLACE], states[0, PARENT] = start, own + 1, -1
+    states[0, CELL], states[0, PLACE], states[0, PARENT], states[0, FACING] = start, own + 1, -1, facing
     scores[0, 0], scores[0, 1] = begin, begin + _WEIGHT * field[start]
-    best[start, own + 1], marks[start, own + 1] = begin, mark
+    best[start, own + 1, :] = np.inf
+    best[start, own + 1, facing], marks[start, own + 1] = begin, mark
     heap[0] = 0
     size, used, expanded = 1, 1, 0
     chosen = -1
@@ -180,7 +198,8 @@ def search_path(
         state = _pop(size, heap, scores)
         size -= 1
         here, interval, step = states[state, CELL], states[state, PLACE], scores[state, 0]
-        if step > best[here, interval]:
+        heading = states[state, FACING]
+        if step > best[here, interval, heading]:
             continue  # reached earlier meanwhile
         until = times[here, interval, ENTER] if interval < counts[here] else np.inf
         is_aside = goal < 0 and state > 0 and not is_goal[here] and until == np.inf
@@ -193,7 +212,8 @@ def search_path(
             there = neighbours[edge]
             if field[there] >= FAR:
                 continue
-            pace = float(costs[edge])
+            ahead = directions[edge]
+            pace = costs[edge] + turns[heading, ahead]
             if state == 0:
                 pace = min(pace, until - step)  # It may have to give way at once.
             after, first = -np.inf, 0
@@ -209,18 +229,22 @@ def search_path(
                 arrival = max(step + pace, after)
                 if arrival >= before or arrival > until or arrival <= step:
                     continue
-                if marks[there, place] == mark and best[there, place] <= arrival:
+                if marks[there, place] == mark and _is_reached(arrival, ahead, best[there, place], turns):
                     continue
                 if arrival == after and closes_circle(arrival, here, there, counts, times, tags):
                     arrival = after + min(0.5, (before - after) / 2)
                     if arrival > until or arrival >= before:
                         continue
-                    if marks[there, place] == mark and best[there, place] <= arrival:
+                    if marks[there, place] == mark and _is_reached(arrival, ahead, best[there, place], turns):
                         continue
                 if used >= len(states):
                     return -1
-                best[there, place], marks[there, place] = arrival, mark
+                if marks[there, place] != mark:
+                    best[there, place, :] = np.inf
+                    marks[there, place] = mark
+                best[there, place, ahead] = arrival
                 states[used, CELL], states[used, PLACE], states[used, PARENT] = there, place, state
+                states[used, FACING] = ahead
                 scores[used, 0], scores[used, 1] = arrival, arrival + _WEIGHT * field[there]
                 _push(used, size, heap, scores)
                 size += 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import pi
+
 import pytest
 
 from rce_fleet.coordination.events import (
@@ -367,3 +369,22 @@ def test_robot_removed_meanwhile_leaves_the_others_their_paths(row: PlannerHarne
     row.tell(Tick())
     assert row.planner.state.ledger.route("R1")[-1] == 56
     assert row.planner.state.ledger.route("R3")[-1] == 58
+
+
+@pytest.mark.parametrize("repairs", [0, 3])
+@pytest.mark.parametrize(("facing", "corner"), [(0.0, 7), (pi / 2, 56)])
+def test_paths_of_single_robots_and_of_all_have_few_turns(repairs: int, facing: float, corner: int) -> None:
+    """A robot drives straight on from where it faces, and turns once."""
+    settings = FleetSettings(repairs=repairs, quarter_turn=1.0, stop=0.5)
+    harness = PlannerHarness(0, 63, settings=settings)
+    if harness.requests:
+        harness.finish_all()
+    harness.tell(PoseSeen("R1", *harness.planner.state.grid.centre(0), facing))
+    harness.tell(PoseSeen("R2", *harness.planner.state.grid.centre(63), 0.0))
+    harness.tell(GoalSet("R1", 62 if corner == 56 else 55))
+    harness.events(1)
+    if not repairs:
+        harness.finish_all()
+    route = harness.planner.state.ledger.route("R1")
+    assert corner in route
+    assert len(route) == 14

@@ -5,9 +5,13 @@ from __future__ import annotations
 from itertools import chain, count
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rce_fleet.coordination.ledger import CellLedger
-from rce_fleet.coordination.path_search import Roads, find_path, moves_to
+from rce_fleet.coordination.path_search import Roads, Turns, find_path, moves_to
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.guidance import RIGHT, UP
+from rce_fleet.planning.motion import Motion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,3 +70,35 @@ def test_moves_up_to_a_start_are_those_of_the_whole_map() -> None:
     whole = moves_to(0, grid.neighbours, set(), frozenset())
     for start in grid.free:
         assert moves_to(0, grid.neighbours, set(), frozenset(), start)[start] == whole[start]
+
+
+@pytest.mark.parametrize(("facing", "corner"), [(RIGHT, 5), (UP, 24)])
+def test_path_has_few_turns(facing: int, corner: int) -> None:
+    """Of all shortest paths the one that begins where the robot faces, with one turn."""
+    grid = GridMap(5, 6)
+    turns = Turns(facing, 6, Motion(quarter_turn=1.0, stop=0.5).turn_steps.tolist())
+    roads = Roads(grid.neighbours, set(), frozenset(), {}, frozenset({29}), {}, turns)
+    ledger = CellLedger()
+    ledger.place("Robot", 0)
+    found = find_path(roads, ledger, "Robot", 29, moves_to(29, grid.neighbours, set(), frozenset()), 10_000)
+    assert found is not None
+    _, path = found
+    assert corner in [cell for cell, _ in path]
+    assert len(path) == 9
+    assert path[-1][1] - path[0][1] == pytest.approx(8 + 1.5)
+
+
+def test_path_is_longer_to_save_turns() -> None:
+    """A zigzag of 8 moves with seven turns; around it 10 moves with two."""
+    zigzag = [0, 1, 7, 8, 14, 15, 21, 22, 28]
+    around = [0, 6, 12, 18, 24, 30, 31, 32, 33, 34, 28]
+    grid = GridMap(6, 6, blocked=frozenset(range(36)) - {*zigzag, *around})
+    turns = Turns(RIGHT, 6, Motion(quarter_turn=1.0, stop=0.5).turn_steps.tolist())
+    field = moves_to(28, grid.neighbours, set(), frozenset())
+    for chosen, expected in ((None, zigzag), (turns, around)):
+        ledger = CellLedger()
+        ledger.place("Robot", 0)
+        roads = Roads(grid.neighbours, set(), frozenset(), {}, frozenset({28}), {}, chosen)
+        found = find_path(roads, ledger, "Robot", 28, field, 10_000)
+        assert found is not None
+        assert [cell for cell, _ in found[1]] == expected[1:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import takewhile
 from random import Random
 
@@ -12,7 +13,9 @@ from rce_fleet.compiled import is_available
 from rce_fleet.coordination.ledger import CellLedger
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.guidance import RIGHT, UP
 from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import PlanningProblem
 from rce_fleet.planning.rerouting import REROUTING_KERNELS, Rerouted, RoutedRobots, reroute
 
@@ -184,6 +187,35 @@ def test_own_costs_lead_one_robot_around() -> None:
     assert found is not None
     assert 22 in found.paths[0][0]
     assert 4 in found.paths[1][0]
+
+
+SLOW_TURNS = Motion(quarter_turn=1.0, stop=0.5)
+
+
+@pytest.mark.parametrize("direction", [RIGHT, UP])
+def test_new_path_has_few_turns(direction: int) -> None:
+    """Of all shortest paths the one that begins where the robot faces, with one turn."""
+    graph = PlanningGraph.from_grid(GridMap(5, 6))
+    motion = replace(SLOW_TURNS, headings=(direction,))
+    found = reroute(graph, routed([0], [29], [[]]), [0], effort=20_000, motion=motion)
+    assert found is not None
+    cells, steps = found.paths[0]
+    corner = 5 if direction == RIGHT else 24
+    assert corner in cells
+    assert len(cells) == 9
+    assert steps[-1] == pytest.approx(9 + 1.5)
+
+
+def test_new_path_is_longer_to_save_turns() -> None:
+    """A zigzag of 8 moves with seven turns; around it 10 moves with two."""
+    zigzag = [0, 1, 7, 8, 14, 15, 21, 22, 28]
+    around = [0, 6, 12, 18, 24, 30, 31, 32, 33, 34, 28]
+    grid = GridMap(6, 6, blocked=frozenset(range(36)) - {*zigzag, *around})
+    graph = PlanningGraph.from_grid(grid)
+    for motion, expected in ((None, zigzag), (replace(SLOW_TURNS, headings=(RIGHT,)), around)):
+        found = reroute(graph, routed([0], [28], [[]]), [0], effort=20_000, motion=motion)
+        assert found is not None
+        assert found.paths[0][0].tolist() == expected[1:]
 
 
 def test_compiled_and_plain_loops_find_the_same_paths() -> None:

@@ -179,6 +179,10 @@ def test_turning_costs_are_those_of_exhaustive_search() -> None:
 def test_motion_follows_from_speed_and_acceleration() -> None:
     motion = Motion.of_robot(cell_size=1.0, speed=0.5, turn_rate=pi / 4, acceleration=0.5)
     assert motion == Motion(quarter_turn=1.0, stop=0.5)
+    late = Motion.of_robot(cell_size=1.0, speed=1.0, turn_rate=pi / 2, turn_acceleration=pi)
+    assert late.quarter_turn == pytest.approx(1.5)  # half a second to the highest rate, half a second back
+    slow = Motion.of_robot(cell_size=1.0, speed=1.0, turn_rate=9.0, turn_acceleration=pi / 2)
+    assert slow.quarter_turn == pytest.approx(2.0)  # it brakes half-way
     yaws = (0.1, pi / 2, pi, -pi, -pi / 2 + 0.2, nan)
     assert [heading_of(yaw) for yaw in yaws] == [RIGHT, UP, LEFT, LEFT, DOWN, UNKNOWN]
 
