@@ -17,6 +17,7 @@ _CELLS = {"minimum": 0, "maximum": MOST_CELL}
 _AMOUNT = {"minimum": 0.0, "maximum": MOST_AMOUNT}
 _POWER = {"minimum": LEAST_CAPACITY, "maximum": MOST_AMOUNT}
 _LEAST_ZERO = {"minimum": 0.0}
+_WEIGHT = {"minimum": 0.0, "maximum": MOST_AMOUNT}
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,8 @@ class ManagerParameters:
         load_lost_after: A task whose load is on a robot that cannot continue fails after this time.
         queue_length: Most tasks in the queue of a busy robot.
         park_after: An idle robot goes out of the way after this time.
+        energy_weight: What a task costs a robot whose usable energy it takes, seconds of way.
+        fairness_weight: What a robot that has worked all the time is dearer than one that has not.
         battery: Thresholds.
         robot: What robots can do.
     """
@@ -91,6 +94,8 @@ class ManagerParameters:
     load_lost_after: float = field(default=3600.0, metadata=_LEAST_ZERO)
     queue_length: int = field(default=3, metadata=_LEAST_ZERO)
     park_after: float = field(default=5.0, metadata=_LEAST_ZERO)
+    energy_weight: float = field(default=60.0, metadata=_WEIGHT)
+    fairness_weight: float = field(default=30.0, metadata=_WEIGHT)
     battery: BatteryParameters = field(default_factory=BatteryParameters)
     robot: RobotParameters = field(default_factory=RobotParameters)
 
@@ -109,7 +114,7 @@ def rules_of(parameters: ManagerParameters) -> TaskRules:
             unreachable_after=parameters.unreachable_after,
             load_lost_after=parameters.load_lost_after,
         ),
-        assignment=AssignmentRules(),
+        assignment=AssignmentRules(energy=parameters.energy_weight, fairness=parameters.fairness_weight),
         battery=BatteryLevels(**{each.name: getattr(battery, each.name) for each in fields(battery)}),
         profile=RobotProfile(**{each.name: getattr(robot, each.name) for each in fields(robot)}),
         queue_length=parameters.queue_length,

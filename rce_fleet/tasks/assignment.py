@@ -26,6 +26,8 @@ _SPARE_TASKS = 50
 _PRICED = 6_000
 """So many pairs of a task and a profile are looked at in a step, or one profile: each takes some twenty
 microseconds. Robots of the other profiles have their turn in the steps after it."""
+_LEAST_ENERGY = 1e-3
+"""Share of a battery; a robot with less energy is as dear as can be."""
 _ATTEMPTS = 4
 """A step assigns at most so often, if robots turn out to have too little energy for tasks."""
 
@@ -41,6 +43,10 @@ class AssignmentRules:
         deadline_window: ... that is left of the time before the last moment to begin.
         keep: What it is worth to leave a task in the queue of its robot: another one takes it over if it
             is at the first stop so much earlier.
+        energy: What a task costs a robot whose battery it empties down to ``BatteryLevels.critical``; in
+            proportion, what takes a part of the energy above that costs the same part of it.
+        fairness: What a robot that has worked all the time is dearer than one that has not worked at all; in
+            proportion to :class:`~rce_fleet.tasks.workloads.Workloads`.
     """
 
     priority: float = 300.0
@@ -48,15 +54,26 @@ class AssignmentRules:
     deadline: float = 2.0
     deadline_window: float = 300.0
     keep: float = 10.0
+    energy: float = 60.0
+    fairness: float = 30.0
 
 
 class FreeRobot(NamedTuple):
-    """A robot that can begin with a task: its name, cell, profile and share of a full battery."""
+    """A robot that can begin with a task.
+
+    Attributes:
+        id: Its name.
+        cell: Where it stands.
+        profile: What it can do.
+        battery: Share of the full battery, 0 .. 1; None: not known, it costs nothing.
+        worked: Share of the time in which it had tasks of late, 0 .. 1.
+    """
 
     id: str
     cell: int
     profile: RobotProfile
     battery: float | None
+    worked: float = 0.0
 
 
 class Choice(NamedTuple):
@@ -260,6 +277,7 @@ class Assigner:
         ways = group.ways = np.full((len(tasks), len(group.names)), inf, np.float32)
         metres = ways if zones == profile.zone_cost else ways.copy()
         needed = np.full(len(tasks), -inf)
+        taken = np.zeros(len(tasks))
         for row, task in enumerate(tasks):
             tail = self._tail(task, group)
             if tail is None:
@@ -273,6 +291,7 @@ class Assigner:
                 end = tail.end
                 to_charger = 0.0 if to_chargers is None or end is None else float(to_chargers[end])
                 needed[row] = share_needed(tail._replace(first=0.0), profile, to_charger)
+                taken[row] = share_needed(tail._replace(first=0.0), profile)
         needed += self._levels.critical
         self._forbid_beyond_batteries(group, metres, needed)
         nearest = ways.min(axis=1, initial=inf)
@@ -282,6 +301,25 @@ class Assigner:
             worth[row] = self.urgency(tasks[row], now, takes if takes < inf else 0.0)
         group.costs = np.divide(ways, profile.speed, dtype=np.float64)
         group.costs -= worth[:, None]
+        group.costs += self._rules.fairness * group.worked
+        self._add_energy(group, metres, taken)
+
+    def _add_energy(self, group: _Group, metres: NDArray[np.float32], taken: NDArray[np.float64]) -> None:
+        """Add what the energy for tasks is worth to robots that have little.
+
+        Args:
+            group: Robots, and their costs.
+            metres: What they drive to the first stops, shape (tasks, robots).
+            taken: What each task takes after its first stop, shares of a battery.
+        """
+        known = np.flatnonzero(~np.isnan(group.batteries))
+        if not self._rules.energy or not len(known):
+            return
+        each = share_needed(Effort(1.0, 0.0, 0.0, None), group.profile)
+        usable = np.maximum(group.batteries[known] - self._levels.critical, _LEAST_ENERGY)
+        shares = metres[:, known] * np.float64(each) if each else np.zeros((len(taken), len(known)))
+        shares = (shares + taken[:, None]) / usable
+        group.costs[:, known] += self._rules.energy * np.minimum(shares, 1.0)
 
     def _forbid_beyond_batteries(
         self, group: _Group, metres: NDArray[np.float32], needed: NDArray[np.float64]
@@ -356,6 +394,7 @@ class _Group:
         self.batteries = np.array(
             [nan if robot.battery is None else robot.battery for robot in robots], np.float64
         )
+        self.worked = np.array([robot.worked for robot in robots], np.float64)
         self.tails: dict[int, Effort] = {}
 
 

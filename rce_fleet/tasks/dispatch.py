@@ -18,6 +18,7 @@ from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
 from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
+from rce_fleet.tasks.workloads import Workloads
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
@@ -76,6 +77,9 @@ class Dispatcher:
         self._ways = IdleWays(self.rules.progress, self._nearest)
         self.chargers = ChargerQueue(self.rules.battery, self._ways)
         self._parking = Parking(self._ways, self.rules.park_after)
+        self._workloads = Workloads()
+        self._has_counted = False
+        """Whether the tasks of a journal are counted as work."""
         self._profiles: dict[str, RobotProfile] = {}
         """Of robots for which zones count."""
         self._queues_due = -inf
@@ -156,6 +160,7 @@ class Dispatcher:
         self._progress.update(now, facts, self._nearest, self._short_of_energy, users)
         self._release_misfits(now)
         ready = self._conditions.update(now)
+        self._count_work(now, facts)
         if facts.grid is None or not facts.is_live:
             return
         idle = {robot.id: robot for robot in facts.robots.values() if self._is_idle(robot)}
@@ -255,6 +260,14 @@ class Dispatcher:
 
     # Parts of a step
 
+    def _count_work(self, now: float, facts: FleetFacts) -> None:
+        if not self._has_counted:
+            self._has_counted = True
+            known = {*self._book.robots, *facts.robots}
+            self._workloads.begin(known, self._book.tasks.values(), now)
+        busy = {task.robot for task in self._book.active_tasks()}
+        self._workloads.update(now, facts.robots, busy)
+
     def _nearest(self, robot: RobotFacts, cells: Iterable[int]) -> int | None:
         if robot.cell is None:
             return None
@@ -289,7 +302,8 @@ class Dispatcher:
 
     def _free(self, robot: RobotFacts) -> FreeRobot:
         assert robot.cell is not None
-        return FreeRobot(robot.id, robot.cell, self.profile(robot.id), robot.battery)
+        worked = self._workloads.share(robot.id)
+        return FreeRobot(robot.id, robot.cell, self.profile(robot.id), robot.battery, worked)
 
     def _start(self, task: Task, robot: str, now: float) -> None:
         self._parking.cells.pop(robot, None)
