@@ -21,7 +21,7 @@ from rce_fleet.manager.planner_sync import FLEET, BlockCell, PlannerCall, Planne
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.clamping import clamped
-from rce_fleet.tasks.dispatch import Dispatcher, TaskRules
+from rce_fleet.tasks.dispatch import Dispatcher, TaskRules, load_libraries
 from rce_fleet.tasks.facts import FleetFacts
 from rce_fleet.tasks.records import FleetEntry
 from rce_fleet.tasks.task import Task
@@ -38,6 +38,8 @@ KEEP_ENDED = 10_000
 KEEP_EVENTS = 200_000
 """So many events are kept in the journal."""
 _TRIM_EVERY = 10_000
+_AT_ONCE = 100
+"""So many events are published in one go."""
 LEAD_S = 60.0
 """People are warned if the journal is so much ahead of the machine's clock, seconds."""
 CLOCK_STEP_S = 2.0
@@ -102,6 +104,8 @@ class FleetManager:
         """The same of the batch after that, to which events are added meanwhile."""
         self._writer: asyncio.Task[None] | None = None
         self._failure = ""
+        self._is_loaded = False
+        """Whether the libraries that choose tasks were loaded."""
         self._is_stale = False
         """Whether the book may have what the journal has not, because that could not be read."""
         self.facts = FleetFacts()
@@ -147,10 +151,7 @@ class FleetManager:
 
     async def step(self) -> None:
         """Take over what the robots did, and send them on. To be called several times a second."""
-        is_behind = True
-        while is_behind:
-            is_behind = self.dispatcher.measure(self.facts)
-            await asyncio.sleep(0)  # Requests are answered meanwhile.
+        await self._prepare_step()
         if self._failure:
             await self._try_journal()
             return
@@ -160,7 +161,8 @@ class FleetManager:
         self._sync.adopt(now)
         if self.facts.is_live:
             self.hand_goals.adopt(self.dispatcher.goals(), now)
-        self.dispatcher.update(now, self.facts)
+        if not await self._dispatch(now):
+            return
         ended = self.statistics.update(now, self.facts, self.book)
         try:
             await self.commit()
@@ -178,6 +180,29 @@ class FleetManager:
                 refusal = await self._planner.set_goal(robot, cell)
                 if refusal:
                     self.goals.refused(robot)
+
+    async def _prepare_step(self) -> None:
+        """Load and measure what the step needs; requests are answered meanwhile."""
+        if self.book.open_count and not self._is_loaded:
+            self._is_loaded = True
+            await asyncio.to_thread(load_libraries)
+        is_behind = True
+        while is_behind:
+            is_behind = self.dispatcher.measure(self.facts)
+            await asyncio.sleep(0)
+
+    async def _dispatch(self, now: float) -> bool:
+        """Decide what the robots do; requests are answered between two parts.
+
+        Returns:
+            Whether that was done; False: the journal failed meanwhile, and the book was made from it again.
+        """
+        book = self.book
+        for _ in self.dispatcher.parts(now, self.facts):
+            await asyncio.sleep(0)
+            if self._failure or self.book is not book:
+                return False
+        return True
 
     def _follow_clock(self, now: float) -> None:
         """Count no step of the clock as time in which robots did something, or did not."""
@@ -368,7 +393,9 @@ class FleetManager:
 
     async def _after_write(self, batch: list[FleetEvent]) -> None:
         """Publish events that are in the journal, and forget old ones from time to time."""
-        self._publish(event_fields(batch))
+        for begin in range(0, len(batch), _AT_ONCE):
+            self._publish(event_fields(batch[begin : begin + _AT_ONCE]))
+            await asyncio.sleep(0)  # Requests are answered meanwhile.
         if batch[-1].number // _TRIM_EVERY != (batch[0].number - 1) // _TRIM_EVERY:
             await self._in_thread(self._journal.forget_events, batch[-1].number - KEEP_EVENTS)
 

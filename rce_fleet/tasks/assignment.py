@@ -11,6 +11,7 @@ import numpy as np
 from rce_fleet.limits import MOST_LATE, within
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, driven, effort_of, share_needed
 from rce_fleet.tasks.matching import cheapest_pairs
+from rce_fleet.tasks.urgency import most_urgent_first
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -219,7 +220,7 @@ class Assigner:
         most = _most_tasks(robots)
         names = {name: group for group in groups for name in group.names}
         urgent = []
-        for task in sorted(tasks, key=lambda task: (-self.urgency(task, now), task.number)):
+        for task in most_urgent_first(tasks, now, self._rules):
             only = task.order.robot
             able = ([names[only]] if only in names else []) if only else groups
             if any(not misfit(task, only or group.names[0], group.profile) for group in able):

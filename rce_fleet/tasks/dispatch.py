@@ -6,23 +6,28 @@ from dataclasses import dataclass, field, replace
 from math import inf
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, misfit
 from rce_fleet.tasks.charging import ChargerQueue
 from rce_fleet.tasks.conditions import Conditions
 from rce_fleet.tasks.energy import BatteryLevels, driven, effort_of
 from rce_fleet.tasks.explaining import why_none, why_none_drives
 from rce_fleet.tasks.idle_ways import IdleWays
+from rce_fleet.tasks.matching_loops import match_rows
 from rce_fleet.tasks.parking import Parking, ParkingCells
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
 from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
+from rce_fleet.tasks.travel_loops import measure_ways
+from rce_fleet.tasks.urgency import most_urgent_first
 from rce_fleet.tasks.workloads import Workloads
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.charging import ChargerUser
@@ -53,6 +58,16 @@ class TaskRules:
     profile: RobotProfile = field(default_factory=RobotProfile)
     queue_length: int = 3
     park_after: float = 5.0
+
+
+def load_libraries() -> None:
+    """Load what measures ways and chooses tasks, which takes a second where the loops are not compiled.
+
+    To be called in a thread before the first tasks: the event loop would stand still for that time.
+    """
+    match_rows(np.zeros((1, 1)))
+    none = np.zeros(0, np.int32)
+    measure_ways(np.zeros(2, np.int32), none, np.zeros(0), np.zeros(1, np.int32))
 
 
 class Dispatcher:
@@ -147,44 +162,39 @@ class Dispatcher:
             now: Seconds since 1970.
             facts: What is known of the robots.
         """
-        self._facts = facts
-        book = self._book
+        for _ in self.parts(now, facts):
+            pass
+
+    def parts(self, now: float, facts: FleetFacts) -> Iterator[None]:
+        """Take one step, a part each time that the iterator is asked for the next one.
+
+        Between two parts requests can be answered, and facts change. Tasks that requests change then have
+        their turn in the next step.
+
+        Args:
+            now: Seconds since 1970.
+            facts: What is known of the robots.
+        """
         self._travel.begin_step()
-        self._queues.begin_step()
-        self._profiles = zone_profiles(book, facts, self.rules.profile)
-        profiles = map(self.profile, facts.robots)
-        self._fastest = max(profiles, key=lambda profile: profile.speed, default=self.rules.profile)
-        if facts.grid is not None:
-            self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision, facts.lanes)
-        users = self._charger_users(facts)
-        self._progress.update(now, facts, self._nearest, self._short_of_energy, users)
-        self._release_misfits(now)
-        ready = self._conditions.update(now)
+        self._follow(now, facts)
+        yield
+        self._conditions.update(now)
         self._count_work(now, facts)
-        if facts.grid is None or not facts.is_live:
+        yield
+        if not self._begin_part(facts):
             return
-        idle = {robot.id: robot for robot in facts.robots.values() if self._is_idle(robot)}
-        taken = self._progress.targets()
-        self._ways.begin_step(now, self._progress.standing)
-        self.chargers.adopt(idle, book.places.chargers, taken)
-        free = [self._free(robot) for robot in idle.values() if self.chargers.can_work(robot)]
-        working = {robot.id for robot in free}
-
-        def begins(task: Task) -> float:
-            return self._begins(task, now, facts.robots.get(task.robot), working)
-
-        avoided = self._progress.avoid.keys()
-        for choice in self._assigner.choose(ready, free, now, self._open_chargers(), avoided, begins):
-            self._start(choice.task, choice.robot, now)
-            idle.pop(choice.robot, None)
-        self.chargers.update(idle, book.places.chargers, taken)
-        if now >= self._queues_due or now < self._queues_due - 2 * QUEUES_EVERY:
-            self._queues_due = now + QUEUES_EVERY
-            self._fill_queues(now, facts)
+        self._assign(now, facts)
+        if self._queues_due - 2 * QUEUES_EVERY <= now < self._queues_due:
+            return
+        yield
+        if not self._begin_part(facts):
+            return
+        self._queues_due = now + QUEUES_EVERY
+        self._fill_queues(now, facts)
+        self._conditions.refresh()
+        yield
+        if self._begin_part(facts):
             self._explain(facts, now)
-        used = {*book.places.chargers}.union(book.used_cells())
-        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
-        self._parking.update(now, idle, self.chargers.charging, facts, cells)
 
     def goals(self) -> dict[str, int | None]:
         """Return where robots shall go; None: the robot shall stand still. Others have no goal."""
@@ -267,6 +277,53 @@ class Dispatcher:
             self._workloads.begin(known, self._book.tasks.values(), now)
         busy = {task.robot for task in self._book.active_tasks()}
         self._workloads.update(now, facts.robots, busy)
+
+    def _begin_part(self, facts: FleetFacts) -> bool:
+        """Take over what has changed since the part before; return whether robots can be given tasks."""
+        self._conditions.leave_changed()
+        self._queues.begin_step()
+        self._take_map(facts)
+        return facts.grid is not None and facts.is_live
+
+    def _take_map(self, facts: FleetFacts) -> None:
+        if facts.grid is not None:
+            zones = self._book.zones
+            self._travel.set_map(facts.grid, facts.shut, zones, facts.map_revision, facts.lanes)
+
+    def _follow(self, now: float, facts: FleetFacts) -> None:
+        """Take over what the robots with tasks did."""
+        self._facts = facts
+        self._queues.begin_step()
+        self._profiles = zone_profiles(self._book, facts, self.rules.profile)
+        profiles = map(self.profile, facts.robots)
+        self._fastest = max(profiles, key=lambda profile: profile.speed, default=self.rules.profile)
+        self._take_map(facts)
+        users = self._charger_users(facts)
+        self._progress.update(now, facts, self._nearest, self._short_of_energy, users)
+        self._release_misfits(now)
+
+    def _assign(self, now: float, facts: FleetFacts) -> None:
+        """Give tasks to idle robots; the others charge, or get out of the way."""
+        book = self._book
+        idle = {robot.id: robot for robot in facts.robots.values() if self._is_idle(robot)}
+        taken = self._progress.targets()
+        self._ways.begin_step(now, self._progress.standing)
+        self.chargers.adopt(idle, book.places.chargers, taken)
+        free = [self._free(robot) for robot in idle.values() if self.chargers.can_work(robot)]
+        working = {robot.id for robot in free}
+
+        def begins(task: Task) -> float:
+            return self._begins(task, now, facts.robots.get(task.robot), working)
+
+        ready, avoided = self._conditions.ready, self._progress.avoid.keys()
+        for choice in self._assigner.choose(ready, free, now, self._open_chargers(), avoided, begins):
+            self._start(choice.task, choice.robot, now)
+            idle.pop(choice.robot, None)
+        self._conditions.refresh()
+        self.chargers.update(idle, book.places.chargers, taken)
+        used = {*book.places.chargers}.union(book.used_cells())
+        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
+        self._parking.update(now, idle, self.chargers.charging, facts, cells)
 
     def _nearest(self, robot: RobotFacts, cells: Iterable[int]) -> int | None:
         if robot.cell is None:
@@ -361,6 +418,7 @@ class Dispatcher:
             for task in tasks:
                 if reason := self._why_not(task, name, facts.robots.get(name)):
                     self._book.advance(task, TaskCause.RELEASE, now, reason, robot="")
+        self._conditions.refresh()  # Another robot may take what was released.
         queues = []
         for robot in facts.robots.values():
             present = self._book.task_of(robot.id)
@@ -372,9 +430,8 @@ class Dispatcher:
                     queues.append(queue)
         if not queues:
             return
-        waiting = [self._book.tasks[task.number] for task in self._conditions.ready]
-        waiting = [task for task in waiting if task.state is TaskState.QUEUED]
-        waiting.sort(key=lambda task: (-self._assigner.urgency(task, now), task.number))
+        waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
+        waiting = most_urgent_first(waiting, now, self.rules.assignment)
         for task, name in self._queues.insert(waiting, queues, self._progress.avoid.keys()):
             text = f"{task.id} is in the queue of {name}"
             self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
@@ -393,9 +450,9 @@ class Dispatcher:
     def _explain(self, facts: FleetFacts, now: float) -> None:
         """Say of tasks that wait why no robot can do them."""
         robots = [robot for robot in facts.robots.values() if not self._book.entry(robot.id).is_out]
+        placed = [self._free(robot) for robot in robots if robot.cell is not None]
         known: dict[object, str] = {}
-        waiting = [self._book.tasks[ready.number] for ready in self._conditions.ready]
-        waiting = [task for task in waiting if task.state is TaskState.QUEUED]
+        waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
         begin = self._explained % len(waiting) if waiting else 0
         self._explained = begin + MOST_EXPLAINED
         for task in (waiting[begin:] + waiting[:begin])[:MOST_EXPLAINED]:
@@ -404,19 +461,30 @@ class Dispatcher:
                 replace(task.order, name="", priority=0, deadline=None, earliest_start=None),
             )
             if like not in known:
-                known[like] = self._why_waiting(task, robots, facts)
+                known[like] = self._why_waiting(task, robots, placed, facts)
             self._conditions.note(task, known[like], now)
 
-    def _why_waiting(self, task: Task, robots: Sequence[RobotFacts], facts: FleetFacts) -> str:
-        """Return why no robot in service can do a task; empty if one can, and is only busy."""
+    def _why_waiting(
+        self, task: Task, robots: Sequence[RobotFacts], placed: Sequence[FreeRobot], facts: FleetFacts
+    ) -> str:
+        """Return why no robot in service can do a task; empty if one can, and is only busy.
+
+        Args:
+            task: The task.
+            robots: Robots in service.
+            placed: Those of them whose cell is known.
+            facts: What is known of the fleet.
+        """
         if not robots:
             return "no robot is in service"
-        placed = [self._free(robot) for robot in robots if robot.cell is not None]
         if not placed:
             return why_none_drives(robots)
+        if only := task.order.robot:
+            robots = [robot for robot in robots if robot.id == only]
+            placed = [robot for robot in placed if robot.id == only]
         reason = why_none(task, placed, self._travel, self._assigner, self._open_chargers())
         if reason or facts.mode != AUTOMATIC:  # the fleet stands: people know why
             return reason
         return why_none_drives(
-            [robot for robot in robots if not misfit(task, robot.id, self.profile(robot.id))]
+            robot for robot in robots if not misfit(task, robot.id, self.profile(robot.id))
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from rce_fleet.tasks.order import Action
 from rce_fleet.tasks.records import AUTOMATIC
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from rce_fleet.tasks.assignment import Assigner, FreeRobot
     from rce_fleet.tasks.facts import RobotFacts
@@ -31,18 +32,19 @@ def why_none(
 
     Args:
         task: The task.
-        robots: Robots in service, at least one.
+        robots: Robots in service that it may be for.
         travel: Distances.
         assigner: Decides about batteries.
         chargers: Cells with chargers.
     """
-    fitting = [robot for robot in robots if not misfit(task, robot.id, robot.profile)]
+    able = (robot for robot in robots if not misfit(task, robot.id, robot.profile))
+    fitting = list(islice(able, MOST_ROBOTS))
     if not fitting:
         return _why_no_fit(task, robots)
     if not chargers and any(stop.action is Action.CHARGE and not stop.cells for stop in task.order.stops):
         return "no charger is open for its stop 'charge': set chargers, or free the cell of one"
     lacks = set()
-    for robot in fitting[:MOST_ROBOTS]:
+    for robot in fitting:
         lack = _lack(task, robot, travel, assigner, chargers)
         if not lack:
             return ""
@@ -58,15 +60,20 @@ def why_none(
     }[worst]
 
 
-def why_none_drives(robots: Sequence[RobotFacts]) -> str:
+def why_none_drives(robots: Iterable[RobotFacts]) -> str:
     """Return why the planner drives none of some robots now; empty if it drives one.
 
     Args:
-        robots: Robots that could do a task.
+        robots: Robots that could do a task; no more of them are taken than up to one that is driven.
     """
-    if not robots or any(robot.is_driven for robot in robots):
+    standing = []
+    for robot in robots:
+        if robot.is_driven:
+            return ""
+        standing.append(robot)
+    if not standing:
         return ""
-    said = [f"{robot.id} is {_how(robot)}{robot.reason and f' ({robot.reason})'}" for robot in robots]
+    said = [f"{robot.id} is {_how(robot)}{robot.reason and f' ({robot.reason})'}" for robot in standing]
     more = f", and {len(said) - MOST_NAMED} more" if len(said) > MOST_NAMED else ""
     return f"no robot that could do it can be sent now: {', '.join(said[:MOST_NAMED])}{more}"
 

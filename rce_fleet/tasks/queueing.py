@@ -7,6 +7,7 @@ and scheduling problem with time windows" (1993).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import islice
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -76,7 +77,9 @@ class Queues:
         queues = sorted(queues, key=lambda queue: (len(queue.tasks), queue.ready))[:MOST_QUEUES]
         room = sum(self._length - len(queue.tasks) for queue in queues)
         waiting = list(tasks[: min(room, MOST_TASKS)])
-        options = {task.number: self._options(task, queues, avoided) for task in waiting}
+        nearest = {task.number: self._nearest_first(task, queues, avoided) for task in waiting}
+        places: dict[tuple[int, str], tuple[float, int]] = {}
+        options = {task.number: self._options(task, nearest[task.number], places) for task in waiting}
         inserted = []
         while waiting:
             task = max(waiting, key=lambda each: _regret(options[each.number]))
@@ -87,8 +90,9 @@ class Queues:
             queue.tasks.insert(place, task)
             inserted.append((task, queue.robot))
             for other in waiting:
+                places.pop((other.number, queue.robot), None)
                 if any(option[2] is queue for option in options[other.number]):
-                    options[other.number] = self._options(other, queues, avoided)
+                    options[other.number] = self._options(other, nearest[other.number], places)
         return inserted
 
     def finish(self, queue: RobotQueue) -> float:
@@ -112,33 +116,49 @@ class Queues:
             seconds += took
         return seconds + self._effort(task, cell, queue.profile).first / queue.profile.speed
 
-    def _options(
+    def _nearest_first(
         self, task: Task, queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]]
-    ) -> list[tuple[float, int, RobotQueue]]:
-        """Return the best place in each of the nearest queues: when all is done there, place and queue."""
-        fitting = [
-            queue
-            for queue in queues
-            if len(queue.tasks) < self._length
-            and not misfit(task, queue.robot, queue.profile)
-            and (task.number, queue.robot) not in avoided
-        ]
+    ) -> list[RobotQueue]:
+        """Return the queues of robots that can do a task, by when they would have done it as their first."""
         ends = []
-        for queue in fitting:
+        for queue in queues:
+            if misfit(task, queue.robot, queue.profile) or (task.number, queue.robot) in avoided:
+                continue
             took, _ = self._leg(task, queue.cell, queue.profile)
             if took < inf:
                 ends.append((queue.ready + took, queue.robot, queue))
         ends.sort(key=lambda end: end[:2])
+        return [queue for _, _, queue in ends]
+
+    def _options(
+        self, task: Task, nearest: Sequence[RobotQueue], places: dict[tuple[int, str], tuple[float, int]]
+    ) -> list[tuple[float, int, RobotQueue]]:
+        """Return the best place in each of the nearest queues: when all is done there, place and queue.
+
+        Args:
+            task: The task.
+            nearest: Queues, the nearest first.
+            places: Best places that are known, by number of a task and robot; others are added.
+        """
         options = []
-        for _, _, queue in ends[:NEAREST]:
-            best = (inf, 0)
-            for place in range(len(queue.tasks) + 1):
-                trial = RobotQueue(queue.robot, queue.profile, queue.cell, queue.ready, [*queue.tasks])
-                trial.tasks.insert(place, task)
-                best = min(best, (self.finish(trial), place))
+        with_room = (queue for queue in nearest if len(queue.tasks) < self._length)
+        for queue in islice(with_room, NEAREST):
+            key = task.number, queue.robot
+            best = places.get(key)
+            if best is None:
+                best = places[key] = self._best_place(task, queue)
             if best[0] < inf:
-                options.append((best[0], best[1], queue))
+                options.append((*best, queue))
         return options
+
+    def _best_place(self, task: Task, queue: RobotQueue) -> tuple[float, int]:
+        """Return when a queue with a task at its best place would be done, and that place."""
+        best = (inf, 0)
+        for place in range(len(queue.tasks) + 1):
+            trial = RobotQueue(queue.robot, queue.profile, queue.cell, queue.ready, [*queue.tasks])
+            trial.tasks.insert(place, task)
+            best = min(best, (self.finish(trial), place))
+        return best
 
     def _leg(self, task: Task, cell: int, profile: RobotProfile) -> tuple[float, int]:
         """Return how long a task takes a robot in a cell, and where it is then."""
