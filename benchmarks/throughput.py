@@ -27,10 +27,12 @@ _MAP = "aisles-33-46.map"
 _EFFORT = 100_000
 """States of the searches for better paths: what compiled loops need some 15 ms for."""
 _PLAIN = FleetSettings(robot_radius=ROBOT_RADIUS)
+_TURNING = replace(_PLAIN, improve_seconds=inf, quarter_turn=0.8, stop=0.4)
 CHOICES = {
     "paths as planned": _PLAIN,
     "better paths": replace(_PLAIN, improve_seconds=inf),
-    "better paths, with turns": replace(_PLAIN, improve_seconds=inf, quarter_turn=0.8, stop=0.4),
+    "better paths, with turns": _TURNING,
+    "the same, learned congestion": replace(_TURNING, learn_congestion=True),
 }
 
 

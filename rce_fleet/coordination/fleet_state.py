@@ -15,7 +15,7 @@ from rce_fleet.coordination.zones import Zone, ZoneBook, union_of
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rce_fleet.planning.grid import GridMap
 
@@ -39,6 +39,8 @@ class FleetState:
         mode: The fleet's mode; counts for robots whose own mode is automatic.
         mode_reason: Why the fleet has its mode, and who set it.
         map_version: Changes when cells or zones do.
+        learned: Steps that moves take for which robots waited of late, see
+            :mod:`rce_fleet.coordination.congestion`; empty: nothing is learned.
         index: Indexes of the robots.
         log: Changes that are not published yet.
     """
@@ -54,6 +56,7 @@ class FleetState:
     mode: RobotMode = RobotMode.AUTOMATIC
     mode_reason: str = ""
     map_version: int = 0
+    learned: dict[tuple[int, int], int] = field(default_factory=dict)
     index: FleetIndex = field(default_factory=FleetIndex)
     log: ChangeLog = field(default_factory=ChangeLog)
     _touched: set[str] = field(default_factory=set)
@@ -85,6 +88,13 @@ class FleetState:
         """Return the moves ``(from, to)`` that a robot may not make."""
         common, own = self.zones.closed(self.grid), self.zones.closed_for(robot, self.grid)
         return common | own if own else common
+
+    def move_costs(self) -> Mapping[tuple[int, int], int]:
+        """Return the steps that moves take in new paths, where it is not 1: of lanes, and learned ones."""
+        lanes = self.zones.move_costs
+        if not self.learned:
+            return lanes
+        return {**lanes, **{move: max(cost, lanes.get(move, 1)) for move, cost in self.learned.items()}}
 
     def zone_users(self, zone: Zone) -> set[str]:
         """Return the robots that claim a cell of a zone or have a path into it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.congestion import LearnedCosts
 from rce_fleet.coordination.events import Instruction, MakePlan
 from rce_fleet.coordination.improving import Improving
 from rce_fleet.coordination.repair import PathRepair
@@ -50,6 +51,7 @@ class PathSupply:
         self._repair = PathRepair(state, settings)
         self._guard = StarvationGuard(state, settings)
         self._improving = Improving(state, settings)
+        self._learned = LearnedCosts(state) if settings.learn_congestion else None
         self._is_alone = settings.planner == INDEPENDENT
         state.ledger.ordered = not self._is_alone
         self._looked_at = -inf
@@ -131,6 +133,8 @@ class PathSupply:
         if self._partial and not self._state.index.under_way:
             self.outdated = True
         if is_tick:
+            if self._learned is not None:
+                self._learned.look(now)
             self._look_for_deadlocks(now)
             self._look_for_room()
             need = self._guard.look(now)

@@ -152,7 +152,7 @@ class PathRepair:
             state.closed(robot),
             state.zones.costs_of(robot),
             frozenset(state.index.goals),
-            state.zones.move_costs,
+            state.move_costs(),
             self._turns(robot),
         )
 

@@ -149,6 +149,8 @@ def request_plan(
         improve: Look for better paths instead; no robot needs a new one.
     """
     for_all = not members and not improve
+    # Better paths are compared by what they took when they were planned.
+    moves = state.zones.move_costs if improve else state.move_costs()
     robots, starts, goals, rests = [], [], [], []
     blocked = set(state.shut)
     for record in state.robots.values():
@@ -176,7 +178,7 @@ def request_plan(
         planner=DEFAULT_PLANNER if settings.planner == "dijkstra" else settings.planner,
         closed=tuple(sorted(state.zones.closed(state.grid))),
         costs=tuple(sorted(state.zones.costs().items())),
-        move_costs=tuple((start, end, cost) for (start, end), cost in state.zones.move_costs.items()),
+        move_costs=tuple((start, end, cost) for (start, end), cost in moves.items()),
         own_costs=_own_costs(state, robots),
         forbidden=tuple(_forbidden(state, robots)),
         own_closed=_own_closed(state, robots),

@@ -45,6 +45,8 @@ class FleetSettings:
         stop: Time that a robot loses by stopping and starting, likewise.
         improve_seconds: Time in which the planner's process looks for better paths after paths have changed,
             see :mod:`rce_fleet.coordination.improving`; with ``lacam`` only. 0: never.
+        learn_congestion: Whether moves for which robots waited of late cost more in new paths and plans, see
+            :mod:`rce_fleet.coordination.congestion`.
         repairs: At most so many robots get new paths at once, between the others'; if more need one, or
             there is none, the planner's process looks for them, see
             :mod:`rce_fleet.coordination.rerouting`. 0: one plan is always made for all.
@@ -85,6 +87,7 @@ class FleetSettings:
     quarter_turn: float = 0.0
     stop: float = 0.0
     improve_seconds: float = 0.0
+    learn_congestion: bool = False
     repairs: int = 3
     repair_effort: int = 12_000
     manual_clearance: float = 0.3

@@ -24,6 +24,7 @@ KNOWN = GRID_PARAMETERS | frozenset(
         *("blocked", "lanes", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
         "improve_seconds",
+        "learn_congestion",
     }
 )
 """Names of all parameters."""
@@ -50,6 +51,7 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
         quarter_turn=read_number(values, "quarter_turn", 0.0),
         stop=read_number(values, "stop", 0.0),
+        learn_congestion=bool(values.get("learn_congestion", default.learn_congestion)),
         improve_seconds=read_number(values, "improve_seconds", IMPROVE_SECONDS),
     )
     for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw", "plan_timeout"):
