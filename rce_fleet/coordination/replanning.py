@@ -14,6 +14,7 @@ import numpy as np
 
 from rce_fleet.coordination.improving import compute_improvement
 from rce_fleet.coordination.rerouting import (
+    MOST_TURNING,
     NO_CELL,
     LedgerCopy,
     Rerouting,
@@ -38,10 +39,6 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
     from rce_fleet.planning.planner import Planner
-
-
-MOST_TURNING = 100
-"""Robots up to which a plan for all counts turns: for 1000 it would take seconds. Better paths count them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,8 @@ NO_CELL = -1
 """In a request: the robot has no such cell."""
 CLOSED = 10_000
 """Cost of a move that a robot may not make: more than any way around."""
+MOST_TURNING = 100
+"""Robots up to which new paths and plans for all count turns: for 1000 it would take seconds."""
 _MOVE = 2
 """Cells of a move."""
 _MOST_EFFORT = 150_000
@@ -121,8 +123,8 @@ def copy_ledger(state: FleetState, robots: Sequence[str], members: Sequence[str]
 def compute_rerouting(request: PlanRequest) -> Rerouting:
     """Return new paths for the members of the request's copy; the same request gives the same paths.
 
-    Turns are not counted: with them searches are so much longer that in dense traffic they find nothing in
-    the time that everyone waits for. Searches for better paths follow, which count them.
+    Large fleets' turns are not counted: with them searches are so much longer that in dense traffic they find
+    nothing in the time that everyone waits for. Searches for better paths follow, which count them.
     """
     copy = request.copy
     assert copy is not None
@@ -134,6 +136,7 @@ def compute_rerouting(request: PlanRequest) -> Rerouting:
         copy.members,
         effort=min(request.effort, _MOST_EFFORT),
         seed=request.seed,
+        motion=motion_of(request) if len(request.robots) <= MOST_TURNING else None,
         forbidden={index: frozenset(cells) for index, cells in request.forbidden} or None,
         own_costs=own_costs,
     )
