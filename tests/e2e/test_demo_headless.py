@@ -63,7 +63,8 @@ async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path) -> None:
     rows = [f"0\tlane.map\t10\t2\t{start}\t1\t{goal}\t1\t5\n" for start, goal in ((0, 5), (3, 8))]
     scen.write_text("version 1\n" + "".join(rows))
     code, report, text = await run_headless(
-        *("--mode", "single", "--world", world, "--scen", scen, "--robots", 2, "--blocked-cells", 2),
+        *(*LIGHT, "--runtime", "process", "--world", world, "--scen", scen),
+        *("--robots", 2, "--blocked-cells", 2),
         timeout=TIMEOUT_S,
     )
     assert code == 0, text
