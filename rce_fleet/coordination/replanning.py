@@ -36,10 +36,13 @@ from rce_fleet.planning.straightening import ends_of
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
     from rce_fleet.planning.planner import Planner
 
+    Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
@@ -261,7 +264,6 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         return PlanResult(request.number, (), (), (), complete=True, rerouting=rerouting)
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
     forbidden = {index: frozenset(cells) for index, cells in request.forbidden}
-    own_closed = {index: frozenset(moves) for indexes, moves in request.own_closed for index in indexes}
     starts = dict(zip(request.robots, request.starts, strict=True))
     targets = assign_targets(
         grid,
@@ -270,7 +272,11 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         rests={robot: cell for robot, cell in zip(request.robots, request.rests, strict=True) if cell >= 0},
         closed=frozenset(request.closed),
         forbidden={request.robots[index]: cells for index, cells in forbidden.items()},
-        own_closed={request.robots[index]: moves for index, moves in own_closed.items()},
+        own_closed={
+            request.robots[index]: frozenset(moves)
+            for indexes, moves in request.own_closed
+            for index in indexes
+        },
     )
     graph, own_costs = weighted_graph(request, grid)
     problem = PlanningProblem.of(
@@ -291,8 +297,8 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
     ends = ends_of(joint.cells, np.array(request.goals, np.int32), lifelong=True)
     counts = steps <= ends[visitors]
     steps, visitors, cells = steps[counts], visitors[counts], cells[counts]
-    kept = _allowed(request.starts, own_closed, visitors.tolist(), cells.tolist()) if own_closed else None
-    is_cut = kept is not None and not all(kept)
+    kept = _allowed(request, visitors, cells)
+    is_cut = not kept.all()
     if is_cut:
         steps, visitors, cells = steps[kept], visitors[kept], cells[kept]
     return PlanResult(
@@ -308,23 +314,33 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
     )
 
 
-def _allowed(
-    starts: Sequence[int],
-    own_closed: Mapping[int, frozenset[tuple[int, int]]],
-    visitors: Sequence[int],
-    cells: Sequence[int],
-) -> list[bool]:
+def _allowed(request: PlanRequest, visitors: Ints, cells: Ints) -> NDArray[np.bool_]:
     """Return which visits are kept: a route ends before the first move that its robot may not make.
 
-    Such moves cost robots so much that they find other ways; but others may push them there in a plan.
+    A planner may not know one-way moves. Moves that are closed for single robots cost these so much that they
+    find other ways; but in a plan others may push them there.
+
+    Args:
+        request: The plan's request.
+        visitors: Robot of each visit, in order, shape (visits,).
+        cells: Cell of each visit, shape (visits,).
     """
-    at, ended = list(starts), set()
-    kept = []
-    for robot, cell in zip(visitors, cells, strict=True):
-        if (at[robot], cell) in own_closed.get(robot, ()):
-            ended.add(robot)
-        kept.append(robot not in ended)
-        at[robot] = cell
+    kept = np.ones(len(cells), dtype=bool)
+    if not request.closed and not request.own_closed:
+        return kept
+    size = request.rows * request.columns
+    order = np.argsort(visitors, kind="stable")
+    robots, ends = visitors[order], cells[order].astype(np.int64)
+    is_first = np.append(True, robots[1:] != robots[:-1])[: len(robots)]
+    begins = np.where(is_first, np.array(request.starts, np.int64)[robots], np.roll(ends, 1))
+    moves = begins * size + ends
+    wrong = np.isin(moves, [start * size + end for start, end in request.closed])
+    for members, closed in request.own_closed:
+        own = np.isin(moves, [start * size + end for start, end in closed])
+        wrong |= own & np.isin(robots, members)
+    ended = np.cumsum(wrong)
+    before = np.where(is_first, ended - wrong, 0)
+    kept[order] = ended == np.maximum.accumulate(before)
     return kept
 
 

@@ -46,6 +46,15 @@ def _closes_circle(now: Ints, after: Ints, occupant: Ints, robot: int, node: int
 
 
 @helper
+def _has_edge(indptr: Ints, neighbours: Ints, start: int, end: int) -> bool:
+    """Return whether an edge leads from one node to another: a partner is not pulled against a direction."""
+    edge = indptr[start]
+    while edge < indptr[start + 1] and neighbours[edge] != end:
+        edge += 1
+    return bool(edge < indptr[start + 1])
+
+
+@helper
 def _choices(
     indptr: Ints,
     neighbours: Ints,
@@ -178,7 +187,8 @@ def _next_nodes(
                 robot = stack[depth, 0]
                 partner = stack[depth, 3]
                 here = now[robot]
-                if stack[depth, 2] == 1 and partner >= 0 and after[partner] == OPEN and taken[here] < 0:
+                is_open = partner >= 0 and after[partner] == OPEN and taken[here] < 0
+                if is_open and stack[depth, 2] == 1 and _has_edge(indptr, neighbours, now[partner], here):
                     after[partner] = here
                     taken[here] = partner
                 depth -= 1

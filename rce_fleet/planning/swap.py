@@ -83,12 +83,13 @@ def _is_swap_possible(
     indptr: Ints, neighbours: Ints, goals: Ints, occupant: Ints, back: int, front: int
 ) -> bool:
     """Return whether the passage from ``back`` over ``front`` leads to a node with two exits."""
-    begin = back
-    while front != begin:
+    begin, passed = back, 0
+    while front != begin and passed < len(indptr):  # one-way passages may end in a ring of such
         count, ahead = _exits(indptr, neighbours, goals, occupant, front, back)
         if count != 1:
             return bool(count > 1)
         back, front = front, ahead
+        passed += 1
     return False
 
 

@@ -366,6 +366,8 @@ def test_a_plan_ends_before_a_move_that_is_closed_for_its_robot() -> None:
     assert compute_plan(request, Careless()).complete
     made = compute_plan(replace(request, own_closed=(((0,), ((1, 2),)),)), Careless())
     assert (made.visitors, made.cells, made.complete) == ((0, 1), (1, 7), False)
+    made = compute_plan(replace(request, own_closed=(), closed=((0, 1),)), Careless())
+    assert (made.visitors, made.cells, made.complete) == ((1,), (7,), False)
 
 
 def test_a_cost_zone_is_avoided_by_all(make: Make) -> None:

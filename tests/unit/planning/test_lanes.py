@@ -209,3 +209,20 @@ def test_long_ways_follow_fast_lanes_to_their_end() -> None:
     joint = load_planner("lacam").plan(problem)
     assert joint.complete
     assert problem.extra_cost(joint.cells) == 0
+
+
+@pytest.mark.parametrize(("seed", "count"), [(0, 32), (2, 32), (0, 40)])
+def test_crowded_robots_do_not_pull_each_other_against_lanes(seed: int, count: int) -> None:
+    """Also where the plan is not complete; the search for a place to pass ends in rings of one-way cells."""
+    grid = GridMap(9, 13)
+    rows = [tuple(range(row * 13, row * 13 + 13)) for row in (0, 4, 8)]
+    columns = [tuple(range(column, 117, 13)) for column in (0, 6, 12)]
+    steps = (1, -1, -1, -1, 1, 1)
+    ways = [way[::step] for way, step in zip((*rows, *columns), steps, strict=True)]
+    lanes = LaneGraph(tuple(Lane(str(way[0]), way, one_way=True) for way in ways))
+    rng = np.random.default_rng(seed)
+    starts, goals = (rng.choice(sorted(lanes.cells), count, replace=False).tolist() for _ in range(2))
+    problem = PlanningProblem.of(lanes.graph(grid), starts, goals, seed=seed, effort=20_000, lifelong=True)
+    joint = load_planner("lacam").plan(problem)
+    paths = [joint.cells[:, robot].tolist() for robot in range(count)]
+    assert check_plan(lanes.restrict(grid), paths, one_way=lanes.closed(grid), rotations=False) == []
