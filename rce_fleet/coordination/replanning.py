@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     Ints = NDArray[np.int32]
 
+
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
     """The input of a plan.
