@@ -156,7 +156,7 @@ async def _lanes(client: FleetClient, names: list[str] | None) -> list[_Place]:
     """Return the moves of lanes.
 
     Raises:
-        typer.BadParameter: There is no such lane.
+        typer.BadParameter: A lane is unknown.
     """
     if not names:
         return []
@@ -164,7 +164,7 @@ async def _lanes(client: FleetClient, names: list[str] | None) -> list[_Place]:
     unknown = [name for name in names if name not in lanes]
     if unknown:
         known = ", ".join(sorted(lanes)) or "none"
-        raise typer.BadParameter(f"there is no lane {unknown[0]!r}; lanes are {known}", param_hint="--lane")
+        raise typer.BadParameter(f"unknown lane {unknown[0]!r}; lanes are {known}", param_hint="--lane")
     return [_Place(f"lane {name}", edges=_moves(lanes[name])) for name in names]
 
 

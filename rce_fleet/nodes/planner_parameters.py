@@ -77,7 +77,7 @@ def read_lane_graph(
         robot_radius: Metres.
 
     Returns:
-        The lanes that robots fit on; None: there is no such parameter.
+        The lanes that robots fit on; None: the parameter is not set.
 
     Raises:
         LanesError: The file cannot be read, its lanes cannot be driven on the grid, or all are too narrow.

@@ -140,7 +140,7 @@ def _end(found: object, where: str, nodes: dict[str, int], grid: GridMap) -> int
         return nodes[found]
     if isinstance(found, str):
         known = ", ".join(sorted(nodes)) or "none"
-        raise LanesError(f"{where}: there is no node {found!r}; nodes are {known}")
+        raise LanesError(f"{where}: unknown node {found!r}; nodes are {known}")
     return _cell(found, where, grid)
 
 

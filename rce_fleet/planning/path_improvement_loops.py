@@ -200,17 +200,9 @@ def _improve_paths(
             if is_free[robot] == 0:
                 continue
             _look_up(
-                robot,
-                starts,
-                goals,
-                back_indptr,
-                back_neighbours,
-                closed_at,
-                closed,
-                fields,
-                is_known,
-                scratch,
-            )
+                robot, starts, goals, back_indptr, back_neighbours, closed_at, closed,
+                fields, is_known, scratch,
+            )  # fmt: skip
             late = steps[robot, lengths[robot] - 1] - max(begins[robot], clock) - fields[robot, starts[robot]]
             if late > latest:
                 worst, latest = robot, late
@@ -229,17 +221,9 @@ def _improve_paths(
             robot = members[index]
             length = lengths[robot]
             _look_up(
-                robot,
-                starts,
-                goals,
-                back_indptr,
-                back_neighbours,
-                closed_at,
-                closed,
-                fields,
-                is_known,
-                scratch,
-            )
+                robot, starts, goals, back_indptr, back_neighbours, closed_at, closed,
+                fields, is_known, scratch,
+            )  # fmt: skip
             old_lengths[index] = length
             old_nodes[index, :length], old_steps[index, :length] = (
                 nodes[robot, :length],

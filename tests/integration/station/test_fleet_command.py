@@ -329,7 +329,7 @@ async def test_lanes_are_blocked_by_their_names(station: Station, url: str) -> N
     assert station.changes == ["PUT zones/block lane bay", "PUT zones/block lane out"]
     assert [zone["edges"] for zone in station.bodies] == [[[4, 12], [12, 20], [12, 4], [20, 12]], [[0, 1]]]
     code, told = await run(url, "block", "--lane", "in")
-    assert (code, "there is no lane 'in'; lanes are bay, out" in " ".join(told.split())) == (2, True)
+    assert (code, "unknown lane 'in'; lanes are bay, out" in " ".join(told.split())) == (2, True)
 
 
 async def test_what_was_blocked_is_freed(station: Station, url: str) -> None:

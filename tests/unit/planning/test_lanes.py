@@ -58,7 +58,7 @@ def test_a_file_has_nodes_by_cell_and_by_metres(tmp_path: Path) -> None:
         ({"nodes": {"a": {"x": "1", "y": 2}}}, "nodes.a.x: expected a number of"),
         ({"nodes": {"a": {"cell": 20}}}, "nodes.a.cell: expected a cell, 0 .. 19, found 20"),
         ({"lanes": [{"path": [0]}]}, "lanes[0].path: expected a list of two or more nodes or cells"),
-        ({"lanes": [{"path": [0, "b"]}]}, "lanes[0].path[1]: there is no node 'b'; nodes are none"),
+        ({"lanes": [{"path": [0, "b"]}]}, "lanes[0].path[1]: unknown node 'b'; nodes are none"),
         ({"lanes": [{"path": [0, True]}]}, "lanes[0].path[1]: expected a cell, 0 .. 19, found True"),
         (
             {"lanes": [{"name": "up", "path": [0, 11]}]},
