@@ -78,10 +78,12 @@ class RunReport:
         if self.tasks is not None:
             faults += self.tasks.faults
         else:
-            reached = self.run.reached if self.run is not None else set()
-            missing = [robot for robot in self.scenario.robots if robot not in reached]
+            run = self.run
+            missing = list(self.scenario.robots) if run is None else run.missing
             if missing:
-                faults.append(f"not at their goals: {', '.join(missing)}")
+                faults.append(f"not at their goals: {'; '.join(missing)}")
+            if missing and run is not None and run.refusal:
+                faults.append(f"the last request that failed: {run.refusal}")
         if self.masters is not None:
             faults += self.masters.faults
         if self.truth is None:

@@ -11,7 +11,7 @@ from rce_fleet.demo.blocking import BlockAction, CellBlocker
 from rce_fleet.drivers.report import WorldReport
 from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
 from rce_fleet.planning.scenario import Scenario
-from rce_fleet.station.api import FleetModel
+from rce_fleet.station.api import FleetModel, RobotModel
 from rce_fleet.station.client import StationClient
 
 POLL_S = 0.2
@@ -57,6 +57,25 @@ class ScenarioRun:
         self._started: float | None = None
         self._ended: float | None = None
         self._known_replans: dict[str, int] = {}
+        self._fleet: FleetModel | None = None
+        self._refusal = ""
+
+    @property
+    def missing(self) -> list[str]:
+        """The robots that are not at their goals: each with what the planner and the world say of it."""
+        known = {} if self._fleet is None else {robot.id: robot for robot in self._fleet.robots}
+        truth = self._truth()
+        cells = {} if truth is None else {robot.id: robot.cell for robot in truth.robots}
+        return [
+            f"{robot} ({_state_of(known.get(robot), cells.get(robot))})"
+            for robot in self.goals
+            if robot not in self.reached
+        ]
+
+    @property
+    def refusal(self) -> str:
+        """Why the last request that failed was not carried out; empty if none failed."""
+        return self._refusal
 
     @property
     def duration(self) -> float:
@@ -89,9 +108,11 @@ class ScenarioRun:
 
     async def _read_fleet(self) -> FleetModel | None:
         try:
-            return await self._station.fleet()
-        except StationUnavailableError:
+            self._fleet = await self._station.fleet()
+        except StationUnavailableError as error:
+            self._refusal = str(error)
             return None
+        return self._fleet
 
     def _all_placed(self, fleet: FleetModel | None) -> bool:
         """Return whether the planner knows the cell of every robot."""
@@ -153,9 +174,26 @@ class ScenarioRun:
         """Send a request; return whether it was carried out."""
         try:
             await request
-        except StationUnavailableError:
+        except StationUnavailableError as error:
+            self._refusal = str(error)
             return False
         except RequestRefusedError as error:
+            self._refusal = str(error)
             self._say(f"refused: {error}")
             return False
         return True
+
+
+def _state_of(robot: RobotModel | None, cell: int | None) -> str:
+    """Describe where a robot is, and what it waits for.
+
+    Args:
+        robot: What the planner knows of it; None if it was never read.
+        cell: The cell that it is in in the simulated world; None if that is not known.
+    """
+    if robot is None:
+        return "the planner does not know it"
+    reason = f", {robot.reason}" if robot.reason else ""
+    goal = f"goal {'none' if robot.goal is None else robot.goal}"
+    where = f"cell {robot.cell}" if robot.cell == cell else f"cell {robot.cell}, in the world cell {cell}"
+    return f"{robot.state}{reason}; {where}; {goal}; plan {robot.plan}, granted {robot.granted}"

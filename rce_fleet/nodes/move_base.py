@@ -215,7 +215,7 @@ class MoveBaseNode:
         decision = stack.control(situation)
         if drives or decision.ending is not None:
             self._command(decision.twist)
-            self._goals.tell(at, decision)
+            self._goals.tell(None if place.problem else at, decision)
         self._note(problem, decision)
         if decision.wants_plan:
             tasks.create_task(self._plan(at))

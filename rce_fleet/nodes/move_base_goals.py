@@ -96,18 +96,19 @@ class MoveBaseGoals:
     ) -> None:
         await self._stack.aclose()
 
-    def tell(self, at: Pose, decision: Decision) -> None:
+    def tell(self, at: Pose | None, decision: Decision) -> None:
         """Publish feedback after a control step, and end the goal if it has ended.
 
         Args:
-            at: The robot's pose in the global frame.
+            at: The robot's pose in the global frame; None, without feedback, if it is not known.
             decision: What was decided.
         """
         goal, ended = self._goal, self._ended
         if goal is None or ended is None:
             return
-        header = {"stamp": self._node.now(), "frame_id": self._frame}
-        goal.publish_feedback(base_position={"header": header, "pose": pose_fields(at)})
+        if at is not None:
+            header = {"stamp": self._node.now(), "frame_id": self._frame}
+            goal.publish_feedback(base_position={"header": header, "pose": pose_fields(at)})
         if decision.ending is not None and not ended.done():
             ended.set_result(decision)
 

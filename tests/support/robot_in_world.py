@@ -44,6 +44,7 @@ class RobotInWorld:
         world: The world.
         commands: The commands that came, with their times in the world.
         senses: Whether scans are published.
+        is_localized: Whether the odometry's place in the map is published.
         map_from_odom: The odometry's frame in the map.
     """
 
@@ -54,6 +55,7 @@ class RobotInWorld:
         self.world = World(walls, boxes, at, rng, lidar=LidarSpec(BEAMS, 6.0), size=size)
         self.commands: list[tuple[float, Twist]] = []
         self.senses = True
+        self.is_localized = True
         self.map_from_odom = Pose(0.4, -0.3, 0.2)
 
     async def run(self) -> None:
@@ -91,6 +93,7 @@ class RobotInWorld:
                 transforms=[
                     StampedTransform(parent, child, Transform.make(at.x, at.y, yaw=at.yaw), stamp).fields
                     for parent, child, at in edges
+                    if self.is_localized or parent != "map"
                 ]
             )
             odom.publish(

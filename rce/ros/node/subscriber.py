@@ -142,6 +142,11 @@ class QueueSink:
         """How many messages were dropped."""
         return self._queue.dropped
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether no more messages will come."""
+        return self._ended
+
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
         """Keep."""
         del source
@@ -183,7 +188,10 @@ async def call_in_order(
             await callback(payload, latched)
         except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - as above
             pass_cancellation(error)
-            _log.exception("the callback of %s failed", topic)
+            if sink.has_ended and isinstance(error, NodeClosedError):
+                _log.debug("the callback of %s ended with its node: %s", topic, error)
+            else:
+                _log.exception("the callback of %s failed", topic)
 
 
 def _is_async(callback: Callable[..., Any]) -> bool:

@@ -236,3 +236,26 @@ async def test_without_scans_or_after_a_stop_it_stands(core: Core) -> None:
         robot.senses = True
         await asyncio.wait_for(goal.result(), 120)
         assert robot.world.contacts == 0
+
+
+async def test_without_its_localization_it_stands_and_claims_to_be_nowhere(core: Core) -> None:
+    """Feedback goes on when the robot knows again where it is, and is never of another place."""
+    async with navigation(core) as (judge, robot, _), client_of(judge) as client:
+        feedback: list[Message] = []
+        goal = await client.send(goal_to(3.2, 1.0), on_feedback=feedback.append)
+        async with asyncio.timeout(60):
+            while robot.world.twist.speed < 0.2:
+                await asyncio.sleep(0.02)
+        robot.is_localized = False
+        lost = robot.world.time
+        async with asyncio.timeout(60):  # the last transform counts for a second
+            while robot.world.time < lost + 1.5 or robot.world.twist.speed > 0:
+                await asyncio.sleep(0.02)
+        heard = len(feedback)
+        await asyncio.sleep(0.5)
+        assert len(feedback) == heard
+        robot.is_localized = True
+        await asyncio.wait_for(goal.result(), 120)
+        places = [message.base_position.pose.position for message in feedback]
+        assert len(places) > heard
+        assert all(START.x - 0.1 < place.x < 3.4 and 0.7 < place.y < 1.3 for place in places)

@@ -11,7 +11,7 @@ import pytest
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFaultError
+from rce.ros.errors import NodeClosedError, ServiceFaultError
 from rce.ros.node import Node, TimerEvent
 from rce.ros.types import Message, TypeRegistry
 
@@ -44,6 +44,35 @@ async def test_callback_awaiting_a_cancelled_task_gets_later_messages(
         publisher.publish(data="good")
         assert await asyncio.wait_for(got.get(), 10) == "good"
     assert "the callback of /t failed" in caplog.text
+
+
+async def test_callback_at_work_while_its_node_leaves_is_no_fault(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What it still wants to publish then goes nowhere; a program need not foresee that."""
+    refused: list[NodeClosedError] = []
+    async with make_node("a") as a:
+        source = await a.advertise("in", STRING)
+        async with make_node("b") as b:
+            output = await b.advertise("out", STRING)
+            at_work = asyncio.Event()
+
+            async def take(message: Message) -> None:
+                at_work.set()
+                while True:
+                    try:
+                        output.publish(message)
+                    except NodeClosedError as error:
+                        refused.append(error)
+                        raise
+                    await asyncio.sleep(0)
+
+            await b.subscribe("in", STRING, take)
+            await source.wait_for_subscribers(timeout=10)
+            source.publish(data="work")
+            await asyncio.wait_for(at_work.wait(), 10)
+    assert refused
+    assert "failed" not in caplog.text
 
 
 async def test_handler_awaiting_a_cancelled_task_answers_with_an_error(make_node: MakeNode) -> None:

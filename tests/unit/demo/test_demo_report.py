@@ -65,7 +65,7 @@ def test_report_of_a_good_run() -> None:
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        (make_report({"Robot1"}), "not at their goals: Robot2"),
+        (make_report({"Robot1"}), "not at their goals: Robot2 (the planner does not know it)"),
         (make_report(set(ROBOTS), collisions=2), "robots collided 2 times"),
         (make_report(set(ROBOTS), problem="the time is over"), "the time is over"),
         (RunReport(SCENARIO, 0, None, None, None, "no engine"), "no engine"),

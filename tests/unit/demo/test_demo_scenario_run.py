@@ -141,3 +141,18 @@ async def test_arrival_needs_the_world_to_confirm_it() -> None:
     with pytest.raises(TimeoutError):
         await asyncio.wait_for(run.run(), 0.2)
     assert run.reached == set()
+
+
+async def test_a_run_that_does_not_end_says_where_its_robots_are() -> None:
+    station = FakeStation()
+    run = make(station)
+    assert run.missing == ["Robot1 (the planner does not know it)"]
+    station.truly_at_goal = False  # the planner takes it for arrived
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(run.run(), 0.2)
+    (missing,) = run.missing
+    assert missing.startswith("Robot1 (arrived; cell 3, in the world cell 1; goal 3; plan ")
+    station.away_at = {station.looks + 1}
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(run.run(), 0.1)
+    assert run.refusal
