@@ -292,6 +292,18 @@ class Dispatcher:
             return last
         return granted.index(report.target)
 
+    def is_pushed(self, record: RobotRecord) -> bool:
+        """Return whether a robot was pushed along its path, and cannot drive back within its cells.
+
+        One cell past its target it may be by itself: the report of its next target is on its way.
+        """
+        granted = self.state.ledger.granted(record.id)
+        index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
+        target = self._target_index(record, granted)
+        if index is None or index <= target + 1:
+            return False
+        return not self._placement.swept(record, granted[target]) <= self.state.ledger.claims(record.id)
+
     def has_left(self, record: RobotRecord) -> bool:
         """Return whether a robot that is not on its path was carried out of its granted cells."""
         here = self.state.grid.cell_at(record.x, record.y)

@@ -97,6 +97,14 @@ class Placement:
         """Return the cells that a robot's hull itself overlaps at its last pose."""
         return self._overlapped(record, self._settings.robot_radius)
 
+    def swept(self, record: RobotRecord, cell: int) -> set[int]:
+        """Return the cells that a robot overlaps on its straight way to the centre of one."""
+        grid, (x, y) = self._state.grid, self._state.grid.centre(cell)
+        shares = [number / _SAMPLES for number in range(_SAMPLES + 1)]
+        places = [(record.x + share * (x - record.x), record.y + share * (y - record.y)) for share in shares]
+        reach = self._settings.robot_radius + _BETWEEN_SAMPLES
+        return set().union(*(grid.cells_touched(*place, reach) for place in places))
+
     def nearest(self, record: RobotRecord) -> int | None:
         """Return the cell for a robot at its last pose, among those that other robots do not claim."""
         return self._place_of(record)[2]
@@ -218,7 +226,7 @@ class Placement:
         is_shared = any(cell in self.hull(other) for other in others)
         if all(map(self._is_still, others)):
             for first in self._exits(record, cell) if is_shared else [cell]:
-                swept = self._swept(record, first)
+                swept = self.swept(record, first)
                 if self._may_sweep(record, swept - own) and all(
                     self.keeps_off((here, centre(first)), other) for other in others
                 ):
@@ -242,14 +250,6 @@ class Placement:
             if not state.is_shut(other) and other not in forbidden and (cell, other) not in closed
         ]
         return sorted(exits, key=lambda other: hypot(*_minus(state.grid.centre(other), (record.x, record.y))))
-
-    def _swept(self, record: RobotRecord, cell: int) -> set[int]:
-        """Return the cells that a robot overlaps on its straight way to the centre of one."""
-        grid, (x, y) = self._state.grid, self._state.grid.centre(cell)
-        shares = [number / _SAMPLES for number in range(_SAMPLES + 1)]
-        places = [(record.x + share * (x - record.x), record.y + share * (y - record.y)) for share in shares]
-        reach = self._settings.robot_radius + _BETWEEN_SAMPLES
-        return set().union(*(grid.cells_touched(*place, reach) for place in places))
 
     def _may_sweep(self, record: RobotRecord, cells: Iterable[int]) -> bool:
         """Return whether a robot may pass over cells: they are open, and no other robot may be there."""

@@ -242,7 +242,9 @@ class FleetPlanner:
 
     def _follow(self, record: RobotRecord) -> None:
         """Update the progress of an active robot."""
-        if not self._dispatcher.arrive(record) and self._dispatcher.has_left(record):
+        if self._dispatcher.is_pushed(record):
+            self._dispatcher.hold(record, "it was pushed along its path")
+        elif not self._dispatcher.arrive(record) and self._dispatcher.has_left(record):
             record.rest = None  # It was carried away: it stays where it was put.
             self._dispatcher.hold(record, "it left its path")
 

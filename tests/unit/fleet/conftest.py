@@ -319,7 +319,12 @@ class SimulatedClients:
             return False
         has_list = self.clients[robot.id].report.revision == record.revision
         claims = self.planner.state.ledger.claims(robot.id)
-        return has_list and (robot.current is None or robot.current.cell in claims)
+        if not has_list or robot.current is None:
+            return has_list
+        # Pushed past the cell that it drives to, it is stopped first.
+        granted, here = self.planner.state.ledger.granted(robot.id), self.grid.cell_at(robot.x, robot.y)
+        ahead = granted[granted.index(robot.current.cell) + 1 :] if robot.current.cell in granted else []
+        return robot.current.cell in claims and here not in ahead
 
     def _check_changes(self) -> None:
         """Add up what the planner says has changed, and compare."""

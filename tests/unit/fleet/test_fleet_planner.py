@@ -269,6 +269,33 @@ def test_robot_off_its_path_is_stopped_and_placed_again(make: Make, monkeypatch:
     assert robot(fleet).cell == 9
 
 
+@pytest.mark.parametrize(
+    ("place", "state", "reason"),
+    [
+        ((3.5, 1.5), RobotState.STOPPING, "it was pushed along its path"),
+        ((2.5, 1.5), RobotState.DRIVING, ""),
+    ],
+    ids=["around a corner", "into the next cell"],
+)
+def test_robot_pushed_along_its_path_is_stopped_if_it_cannot_drive_back(
+    make: Make,
+    monkeypatch: pytest.MonkeyPatch,
+    place: tuple[float, float],
+    state: RobotState,
+    reason: str,
+) -> None:
+    """Its move client sends it back to the corner that it drove to, and navigation would cut that."""
+    fleet = make(GridMap(blocked=frozenset({3, 8, 9, 18})), [0], [12])
+    fleet.run(lambda: fleet.robots["Robot1"].x > 2.1)
+    assert robot(fleet).granted[-4:] == (2, 10, 11, 12)
+    assert fleet.clients["Robot1"].report.target == 2
+    monkeypatch.setattr(fleet, "check", lambda: None)  # The robot is where it must not be: that is the point.
+    fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = place
+    fleet.tell(PoseSeen("Robot1", *place, 0.0))
+    assert (robot(fleet).state, robot(fleet).reason) == (state, reason)
+    fleet.run(fleet.all_arrived)
+
+
 def test_a_removed_robot_leaves_its_cells(make: Make) -> None:
     fleet = make(GridMap(1, 3), [0, 1])
     fleet.ask(GoalSet("Robot1", 2))
