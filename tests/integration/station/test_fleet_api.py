@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +249,15 @@ async def check_client(fleet: ManagedFleet) -> None:
         assert (await client.statistics()).robots == 2
 
 
+def put_in_the_way(file: Path) -> None:
+    """Make a folder of a file, so that it cannot be written; the station may be writing it at this moment."""
+    while not file.is_dir():
+        file.unlink(missing_ok=True)
+        with suppress(FileExistsError):
+            file.mkdir()
+    (file / "in the way").mkdir()
+
+
 async def check_webhooks(fleet: ManagedFleet, tmp_path: Path) -> None:
     receiver, file = Receiver(), tmp_path / "station" / "webhooks.json"
     async with receiver.running() as target:
@@ -272,8 +281,7 @@ async def check_webhooks(fleet: ManagedFleet, tmp_path: Path) -> None:
         async with fleet_station(fleet.core.uri, file) as url, FleetClient(url) as client:
             await until(lambda: len(receiver.numbers) > known, "the delivery after a restart")
             kept = file.read_bytes()
-            file.unlink()
-            (file / "in the way").mkdir(parents=True)
+            put_in_the_way(file)
             with pytest.raises(ApiError, match=r"cannot be removed: .*check --state-dir") as refused:
                 await client.remove_webhook(hook.id)
             assert (refused.value.status, [one.id for one in await client.webhooks()]) == (507, [hook.id])
