@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from playwright.async_api import Page, ViewportSize, async_playwright
+from support.browser import CHROMIUM
 from support.demo import Demo, run_headless, running_demo
 from support.engine import until
 from support.ports import free_row
@@ -24,7 +24,6 @@ pytestmark = [
     pytest.mark.timeout(900),
 ]
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 DESKTOP, PHONE = ViewportSize(width=1280, height=800), ViewportSize(width=390, height=844)
 COUNT = 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import AsyncIterator
 from math import hypot
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import pytest
 import pytest_asyncio
 from playwright.async_api import Browser, Page, ViewportSize, async_playwright
+from support.browser import CHROMIUM
 from support.demo import Demo, running_demo
 
 from rce_fleet.demo.floor import FLOOR
@@ -26,7 +26,6 @@ pytestmark = [
     pytest.mark.timeout(900),
 ]
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 BROWSER = (
     "--no-sandbox",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from contextlib import AsyncExitStack, asynccontextmanager
 from math import pi
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import aiohttp
 import pytest
 from aiohttp.test_utils import TestServer
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 from support.resting_robot import PACKAGES, STATUS, RestingRobot, fleet_program
 
 from rce.ros.core import Core
@@ -28,8 +28,6 @@ from rce_fleet.station.view import FleetView
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 60_000
 PLACE = (2.5, 3.5)
 WALLS = "_walls:=[0]"
@@ -189,6 +187,7 @@ async def test_the_grid_is_changed_on_the_page() -> None:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
         try:
             page = await browser.new_page()
+            await page.add_init_script(FEW_FRAMES)
             page.set_default_timeout(WAIT_MS)
             await page.goto(url)
             await page.wait_for_function("rceFleet.fleet.robots.get('Robot1')?.cell === 26")

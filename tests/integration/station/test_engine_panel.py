@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 from collections import Counter
 from typing import Any
 
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from support.browser import CHROMIUM
 
 from rce_fleet.station import engine_watch
 from rce_fleet.station.engine_watch import EngineWatch
@@ -21,7 +21,6 @@ from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
 MB = 1 << 20
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ADVICE = {
     "about": "too small",
     "text": "uses 95 MB of its 100 MB of memory",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
+from support.browser import CHROMIUM
 from support.layers import ROBOT, STATE, RobotTopics, pose, scan
 from support.multimaster import DiscoveryNetwork
 
@@ -32,7 +32,6 @@ from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
 TYPES = TypeRegistry(PackageIndex([]))
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARTIFACTS = Path(__file__).parents[3] / "artifacts"
 LIMIT_S = 40
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import pytest
 from aiohttp.test_utils import TestServer
+from support.browser import BROWSER, CHROMIUM
 from unit.station.test_station_view import changes, pose, robot, state
 
 from rce_fleet.station.feed import Feed
@@ -14,8 +14,6 @@ from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 40_000
 
 SHOWN = """() => {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -10,12 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 from integration.station.test_page_operator import drag
 from integration.station.test_robot_control import Site, site
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 
 if TYPE_CHECKING:
     from playwright.async_api import Page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 60_000
 
 pytestmark = pytest.mark.needs("chromium")
@@ -31,6 +29,7 @@ async def opened(made: Site) -> AsyncIterator[Page]:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
         try:
             page = await browser.new_page(viewport={"width": 1280, "height": 1000})
+            await page.add_init_script(FEW_FRAMES)
             page.on("pageerror", lambda error: problems.append(str(error)))
             page.set_default_timeout(WAIT_MS)
             await page.goto(str(made.client.make_url("/")))

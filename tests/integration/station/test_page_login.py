@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from integration.station.test_page_operator import Planner
 from integration.station.test_robot_control import Login
+from support.browser import BROWSER, CHROMIUM
 from support.ports import free_port
 from unit.station.test_station_view import robot, state
 
@@ -22,8 +22,6 @@ from rce_fleet.station.view import FleetView
 if TYPE_CHECKING:
     from playwright.async_api import Page, Route
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 60_000
 
 pytestmark = pytest.mark.needs("chromium")

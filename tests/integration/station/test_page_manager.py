@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 from support.fleet_station import fleet_station
 from support.managed_fleet import ManagedFleet, managed_fleet
 
 if TYPE_CHECKING:
     from playwright.async_api import Page, Response
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 150_000
 
 pytestmark = pytest.mark.needs("chromium")
@@ -37,6 +35,7 @@ async def opened(url: str) -> AsyncIterator[Page]:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
         try:
             page = await browser.new_page(viewport={"width": 1280, "height": 900})
+            await page.add_init_script(FEW_FRAMES)
             page.on("console", lambda said: problems.append(said.text) if said.type == "error" else None)
             page.on("response", lambda answer: problems.extend(refused(answer)))
             page.on("pageerror", lambda error: problems.append(str(error)))
@@ -183,8 +182,9 @@ async def test_deadlines_are_watched_beyond_many_tasks(tmp_path: Path) -> None:
     async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
         while (await fleet.ask("GET", "/map")).status != 200:
             await asyncio.sleep(0.1)
-        for _ in range(205):
-            await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "earliest_start": 4e9})
+        order = {"stops": [{"cell": 5}], "earliest_start": 4e9}
+        for _ in range(41):
+            await asyncio.gather(*(fleet.ask("POST", "/tasks", order) for _ in range(5)))
         async with fleet_station(fleet.core.uri) as url, opened(url) as page:
             await check_late_task(page, fleet)
             await page.locator("#tasks td", has_text="and 106 more").wait_for()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
 from aiohttp.test_utils import TestServer
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 from unit.station.test_station_view import pose, robot, state
 
 from rce_fleet.station.feed import Feed
@@ -20,8 +20,6 @@ from rce_fleet.station.view import FleetView
 if TYPE_CHECKING:
     from playwright.async_api import Page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 60_000
 COUNT = 300
 SPLIT = "WebGL below, canvas for robots"
@@ -48,6 +46,7 @@ async def opened(query: str = "") -> AsyncIterator[Page]:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
         try:
             page = await browser.new_page(viewport={"width": 1280, "height": 900})
+            await page.add_init_script(FEW_FRAMES)
             page.on("console", lambda said: problems.append(said.text) if said.type == "error" else None)
             page.on("pageerror", lambda error: problems.append(str(error)))
             page.set_default_timeout(WAIT_MS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from aiohttp.test_utils import TestServer
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 from unit.station.test_station_view import changes, pose, robot, state
 
 from rce_fleet.station.feed import Feed
@@ -25,8 +25,6 @@ from rce_fleet.station.view import FleetView
 if TYPE_CHECKING:
     from playwright.async_api import Browser, Page, Route
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 WAIT_MS = 60_000
 
 pytestmark = pytest.mark.needs("chromium")
@@ -76,6 +74,7 @@ class Site:
 
     async def open(self, width: int = 1280) -> Page:
         page = await self.browser.new_page(viewport={"width": width, "height": 900})
+        await page.add_init_script(FEW_FRAMES)
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.set_default_timeout(WAIT_MS)
         await page.goto(self.url)

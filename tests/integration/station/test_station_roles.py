@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import aiohttp
 import pytest
 from aiohttp.test_utils import TestServer
+from support.browser import CHROMIUM
 from support.engine import until
 from support.master_program import master
 from yarl import URL
@@ -23,7 +23,6 @@ from rce_fleet.station.view import FleetView
 
 pytestmark = pytest.mark.timeout(180)
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ROLES = ("viewer", "user", "operator", "admin")
 
 

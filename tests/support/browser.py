@@ -1,0 +1,14 @@
+"""The browser that tests of the page drive."""
+
+from __future__ import annotations
+
+import shutil
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = ("--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking")
+FEW_FRAMES = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 100);
+window.cancelAnimationFrame = clearTimeout;
+"""
+"""To run in a page before its own scripts: ten frames a second. Without a graphics card sixty take a whole
+core while robots move or their poses are noisy, and make others late."""
