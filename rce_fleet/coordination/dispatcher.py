@@ -298,8 +298,10 @@ class Dispatcher:
         One cell past its target it may be by itself: the report of its next target is on its way.
         """
         granted = self.state.ledger.granted(record.id)
-        index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
         target = self._target_index(record, granted)
+        if target + 2 >= len(granted):
+            return False
+        index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
         if index is None or index <= target + 1:
             return False
         return not self._placement.swept(record, granted[target]) <= self.state.ledger.claims(record.id)

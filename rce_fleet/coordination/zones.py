@@ -320,14 +320,10 @@ def _closed_by(zones: Iterable[Zone], grid: GridMap) -> frozenset[tuple[int, int
     """Return the moves between cells of a map that some zones do not allow."""
     closed: set[tuple[int, int]] = set()
     for zone in zones:
-        closed.update(zone.edges)
+        closed |= grid.passable(zone.edges)
         if zone.direction is not None and zone.kind is ZoneKind.ONE_WAY:
-            against = zone.direction.against(grid.columns)
-            for cell in zone.cells:
-                closed |= {(cell, cell + against), (cell - against, cell)}
-    return frozenset(
-        (start, end) for start, end in closed if start in grid and end in grid and grid.adjacent(start, end)
-    )
+            closed |= grid.moves_by(zone.direction.against(grid.columns), zone.cells)
+    return frozenset(closed)
 
 
 def union_of(sets: Sequence[frozenset[int]]) -> frozenset[int]:

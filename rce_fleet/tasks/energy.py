@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce_fleet.tasks.order import Action
@@ -65,12 +65,12 @@ class Effort(NamedTuple):
 
 
 def driven(zone_cost: Mapping[str, float]) -> dict[str, float]:
-    """Return of zones' costs those that change what a robot drives: it cannot enter the zone.
+    """Return of zones' costs those that change what a robot drives: cells or moves are closed to it.
 
     Other costs only choose robots and ways: a metre takes as much out of the battery as elsewhere. Detours
     that robots make around such zones are not counted.
     """
-    return {name: factor for name, factor in zone_cost.items() if factor == inf}
+    return {name: factor for name, factor in zone_cost.items() if not isfinite(factor)}
 
 
 def effort_of(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import pi
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.tasks.task import Task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from rce_fleet.planning.grid import GridMap
 
 AUTOMATIC = "automatic"
 """The mode in which the planner drives a robot."""
@@ -186,6 +189,19 @@ class Zone:
     def applies_to(self, robot: str) -> bool:
         """Return whether the rule is for this robot."""
         return not self.robots or robot in self.robots
+
+    @property
+    def closes_moves(self) -> bool:
+        """Whether it closes moves between cells that robots may be in."""
+        return self.kind == "one_way" or bool(self.edges)
+
+    def closed(self, grid: GridMap) -> frozenset[tuple[int, int]]:
+        """Return the moves ``(from, to)`` between cells beside each other that it does not allow."""
+        moves = grid.passable(self.edges)
+        if self.kind == "one_way":
+            against = (-1, -grid.columns, 1, grid.columns)[round((self.value or 0.0) / (pi / 2)) % 4]
+            moves |= grid.moves_by(against, self.cells)
+        return moves
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from math import inf
+from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     """How much a metre in zones counts, by zone's name."""
     Graph = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
 
+CLOSES_MOVES = -inf
+"""As a zone's cost: it is for this robot, and closes moves between its cells. A metre counts as elsewhere."""
 MOST_BYTES = 128_000_000
 """Memory of the distances that are kept: on a map of 10 000 cells those to 3000 cells, more than the stops of
 1000 open deliveries. With less than all stops need, each step would compute all of them anew."""
@@ -46,7 +48,8 @@ _AT_ONCE_PLAIN = 16
 class TravelCosts:
     """Distances on the map, in metres that count as the robots' zones make them.
 
-    A robot may leave a cell that is shut, and may not enter one.
+    A robot may leave a cell that is shut, and may not enter one. Zones may close moves between cells:
+    one-way zones and edges.
 
     With many sets of zones, the distances of all sets would take longer than a step and more memory than is
     kept. Those that are not computed yet are estimated: the distance without the zones that are the robot's
@@ -61,7 +64,7 @@ class TravelCosts:
         self._grid: GridMap | None = None
         self._shut: frozenset[int] = frozenset()
         self._revision: object = None
-        self._zones: dict[str, tuple[int, ...]] = {}
+        self._zones: dict[str, Zone] = {}
         self._lanes: LaneGraph | None = None
         self.epoch = 0
         self._graphs: OrderedDict[Costs, Graph] = OrderedDict()
@@ -93,14 +96,13 @@ class TravelCosts:
             revision: Differs for different maps.
             lanes: Lanes that robots keep to: metres on slow ones count more.
         """
-        cells = {name: zone.cells for name, zone in zones.items()}
         is_same = grid is self._grid and lanes == self._lanes
-        if revision == self._revision and cells == self._zones and is_same:
+        if revision == self._revision and is_same and _rules(zones) == _rules(self._zones):
             return
         self._stale = {**self._stale, **self._fields} if is_same else {}
         self.epoch += not is_same
         self._lanes = lanes
-        self._grid, self._shut, self._revision, self._zones = grid, shut, revision, cells
+        self._grid, self._shut, self._revision, self._zones = grid, shut, revision, dict(zones)
         self._graphs.clear()
         self._parts.clear()
         self._fields.clear()
@@ -145,7 +147,8 @@ class TravelCosts:
 
         Args:
             goal: The cell.
-            zone_cost: How much a metre in a zone counts, by zone's name; ``inf``: it cannot be entered.
+            zone_cost: How much a metre in a zone counts, by zone's name; ``inf``: it cannot be entered;
+                :data:`CLOSES_MOVES`.
         """
         if self._grid is None:
             return np.zeros(0, np.float32)
@@ -236,7 +239,22 @@ class TravelCosts:
 
     def _can_enter(self, goal: int, costs: Costs) -> bool:
         forbidden = (name for name, factor in costs if factor == inf)
-        return goal not in self._shut and not any(goal in self._zones.get(name, ()) for name in forbidden)
+        return goal not in self._shut and not any(goal in self._cells(name) for name in forbidden)
+
+    def _cells(self, name: str) -> tuple[int, ...]:
+        """Return the cells of a zone; none of one that is unknown."""
+        zone = self._zones.get(name)
+        return () if zone is None else zone.cells
+
+    def _closed(self, grid: GridMap, costs: Costs) -> list[tuple[int, int]]:
+        """Return the moves ``(from, to)`` that zones for all robots, or those of some costs, do not allow."""
+        own = {name for name, factor in costs if not isfinite(factor)}
+        closing = (
+            zone
+            for name, zone in self._zones.items()
+            if zone.closes_moves and (not zone.robots or name in own)
+        )
+        return [move for zone in closing for move in zone.closed(grid)]
 
     def _free(self, grid: GridMap, costs: Costs) -> Cells:
         """Return which cells a robot may enter, shape (cells,)."""
@@ -244,7 +262,7 @@ class TravelCosts:
         free[list(self._shut)] = False
         for name, factor in costs:
             if factor == inf:
-                free[[cell for cell in self._zones.get(name, ()) if cell in grid]] = False
+                free[[cell for cell in self._cells(name) if cell in grid]] = False
         return free
 
     def _compute(self, grid: GridMap, goals: Sequence[int], costs: Costs) -> list[Floats]:
@@ -271,10 +289,13 @@ class TravelCosts:
         free = self._free(grid, costs)
         weight = np.full(len(grid), grid.cell_size, np.float64)
         for name, factor in costs:
-            if factor < inf:
-                inside = [cell for cell in self._zones.get(name, ()) if cell in grid]
+            if isfinite(factor):
+                inside = [cell for cell in self._cells(name) if cell in grid]
                 weight[inside] *= max(LEAST_FACTOR, factor)  # else no way would be the shortest
         keep = free[heads]
+        if closed := self._closed(grid, costs):
+            starts, ends = np.array(closed, np.int64).T
+            keep &= ~np.isin(tails.astype(np.int64) * len(grid) + heads, starts * len(grid) + ends)
         heads, tails = heads[keep], tails[keep]
         lengths = (weight[heads] + weight[tails]) / 2
         if self._lanes is not None:
@@ -336,6 +357,14 @@ def _reached(part: Cells) -> Cells:
     wide[:, 1:] |= part[:, :-1]
     wide[:, :-1] |= part[:, 1:]
     return wide
+
+
+def _rules(zones: Mapping[str, Zone]) -> dict[str, tuple[object, ...]]:
+    """Return what of zones makes ways longer or closes them, by name."""
+    return {
+        name: (zone.cells, *((zone.edges, zone.value, zone.robots) if zone.closes_moves else ()))
+        for name, zone in zones.items()
+    }
 
 
 def _costs(zone_cost: Mapping[str, float] | None) -> Costs:

@@ -1,10 +1,12 @@
-"""What zones make of robots' ways: detours around cells that one robot may not enter, and dearer metres."""
+"""What zones make of robots' ways: detours around what is closed to one of them, and dearer metres."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.travel import CLOSES_MOVES
 
 if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
@@ -15,9 +17,10 @@ if TYPE_CHECKING:
 def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> dict[str, RobotProfile]:
     """Return the profiles of robots for which zones count, with what a metre in each zone counts.
 
-    A zone that is blocked for some robots counts without end for them. What a robot's own profile says about
-    a cost zone comes before the zone's value. Robots with the same costs and the same profile share one
-    object, so that they are looked at together.
+    A zone that is blocked for some robots counts without end for them, and one that closes moves for them is
+    named with :data:`CLOSES_MOVES`. What a robot's own profile says about a cost zone comes before the zone's
+    value. Robots with the same costs and the same profile share one object, so that they are looked at
+    together.
 
     Args:
         book: Zones and profiles.
@@ -27,7 +30,7 @@ def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> d
     zones = [
         zone
         for zone in book.zones.values()
-        if zone.kind == "cost" or (zone.kind == "blocked" and zone.robots and zone.cells)
+        if zone.kind == "cost" or (zone.robots and (zone.closes_moves or zone.kind == "blocked"))
     ]
     if not zones:
         return {}
@@ -45,7 +48,8 @@ def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> d
         key = id(base), tuple(zone.id for zone in applied)
         if key not in made:
             costs = {zone.id: zone.value or 1.0 for zone in applied if zone.kind == "cost"}
-            shut = {zone.id: inf for zone in applied if zone.kind == "blocked"}
-            made[key] = replace(base, zone_cost={**costs, **base.zone_cost, **shut})
+            shut = {zone.id: inf for zone in applied if zone.kind == "blocked" and zone.cells}
+            closing = {zone.id: CLOSES_MOVES for zone in applied if zone.closes_moves}
+            made[key] = replace(base, zone_cost={**costs, **base.zone_cost, **closing, **shut})
         found[robot] = made[key]
     return found

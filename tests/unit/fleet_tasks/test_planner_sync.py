@@ -7,6 +7,7 @@ from math import inf, pi
 
 import pytest
 
+from rce_fleet.manager.convert import show_profile
 from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
 from rce_fleet.manager.zones import checked, read_zone, zone_fields
 from rce_fleet.planning.grid import GridMap
@@ -303,6 +304,30 @@ def test_ways_lead_around_a_robots_forbidden_cells() -> None:
     assert effort_of(task, 0, travel, profiles["Robot1"]).first == inf
     assert effort_of(task, 1, travel, profiles["Robot1"]).first < inf
     assert effort_of(task, 0, travel, profiles["Robot2"]).first == 5.0
+
+
+@pytest.mark.parametrize(
+    "zone",
+    [
+        Zone("aisle", "one_way", (1, 2, 3), 0.0, robots=("Robot1",)),
+        Zone("aisle", "blocked", (), edges=((3, 2), (2, 1)), robots=("Robot1",)),
+    ],
+)
+def test_ways_do_not_lead_against_a_robots_zone(zone: Zone) -> None:
+    """Time and energy count the way around; of a robot that the zone is not for, the straight one."""
+    book = TaskBook()
+    book.emit(zone, "zone", 0.0)
+    facts = FleetFacts(robots={name: RobotFacts(name) for name in ("Robot1", "Robot2")})
+    profile = RobotProfile(zone_cost={"aisle": 1.5})
+    profiles = zone_profiles(book, facts, profile)
+    assert show_profile(profiles["Robot1"]).zone_cost == {}
+    assert "Robot2" not in profiles
+    travel, grid = TravelCosts(), GridMap(2, 8)
+    travel.set_map(grid, grid.blocked, book.zones, 0)
+    task = book.create(Order((Stop(Action.GO, (0,)),)), 0.0)
+    for in_metres in (False, True):
+        assert effort_of(task, 4, travel, profiles["Robot1"], in_metres=in_metres).first == 6.0
+        assert effort_of(task, 4, travel, RobotProfile(), in_metres=in_metres).first == 4.0
 
 
 def test_another_grid_holds_tasks_and_removes_places() -> None:

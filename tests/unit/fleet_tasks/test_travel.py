@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from math import inf
+from dataclasses import replace
+from math import inf, pi
 from random import Random
 from typing import Any
 
@@ -16,7 +17,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.tasks import travel as travel_module
 from rce_fleet.tasks.records import Zone
-from rce_fleet.tasks.travel import REFRESHED, TravelCosts
+from rce_fleet.tasks.travel import CLOSES_MOVES, REFRESHED, TravelCosts
 from rce_fleet.tasks.travel_loops import measure_ways
 
 COST = {"ice": 2.5, "shut": inf}
@@ -52,6 +53,28 @@ def test_a_robot_may_leave_a_blocked_cell_but_not_enter_it() -> None:
     assert travel.metres(1, 2) == 1.0
     assert travel.metres(2, 1) == float("inf")
     assert travel.metres(0, 2) == float("inf")
+
+
+def test_ways_do_not_lead_against_zones() -> None:
+    """On a floor of two rows the lower one leads to the right; back is along the upper one."""
+    travel, grid = TravelCosts(), GridMap(2, 5)
+    zone = Zone("aisle", "one_way", (1, 2, 3), 0.0)
+    travel.set_map(grid, frozenset(), {"aisle": zone}, 0)
+    assert (travel.metres(0, 4), travel.metres(4, 0)) == (4.0, 6.0)
+    travel.set_map(grid, frozenset(), {"aisle": replace(zone, value=pi)}, 0)
+    assert (travel.metres(0, 4), travel.metres(4, 0)) == (6.0, 4.0)
+    travel.set_map(grid, frozenset(), {"gate": Zone("gate", "blocked", (), edges=((1, 2), (2, 99)))}, 0)
+    assert (travel.metres(0, 4), travel.metres(4, 0)) == (6.0, 4.0)
+    travel.set_map(grid, frozenset(range(5, 10)), {"aisle": zone}, 0)
+    assert (travel.metres(0, 4), travel.metres(4, 0)) == (4.0, inf)
+
+
+def test_moves_that_are_closed_to_one_robot_are_open_to_others() -> None:
+    travel, grid = TravelCosts(), GridMap(2, 5)
+    zone = Zone("aisle", "one_way", (1, 2, 3), 0.0, robots=("Robot1",))
+    travel.set_map(grid, frozenset(), {"aisle": zone}, 0)
+    assert (travel.metres(4, 0), travel.metres(4, 0, {"aisle": CLOSES_MOVES})) == (4.0, 6.0)
+    assert travel.metres(4, 0, {"aisle": 2.0}) == 6.0, "metres count twice, and around it is nearer"
 
 
 def test_ways_follow_lanes() -> None:
@@ -258,3 +281,14 @@ def test_no_task_behind_a_cell_that_is_blocked_for_the_robot(
     task = floor.go(8)
     floor.run(1)
     assert floor.task(task).robot == "Far"
+
+
+def test_a_task_is_given_to_the_robot_that_may_drive_the_nearest_way(floor: Any) -> None:
+    """Behind a one-way aisle is farther than before it."""
+    floor.grid = floor.facts.grid = floor.book.grid = GridMap(2, 9)
+    floor.add("Behind", 5)
+    floor.add("Before", 0)
+    floor.book.zones["aisle"] = Zone("aisle", "one_way", tuple(range(1, 8)), 0.0)
+    task = floor.go(3)
+    floor.run(1)
+    assert floor.task(task).robot == "Before"
