@@ -22,6 +22,7 @@ from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.parameters import LaserModel
 from rce_fleet.nodes.amcl import AmclNode
 from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
+from rce_fleet.nodes.kept_pose import StoredPose
 from rce_fleet.nodes.map_messages import map_fields
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_fields, pose_of
@@ -323,8 +324,10 @@ async def localized_before(*, odometry: Pose = ORIGIN) -> AsyncIterator[World]:
             async with asyncio.timeout(PATIENCE):
                 while await here.judge.get_param("/amcl/initial_cov_aa", None) is None:
                     await here.judge.sleep(0.1)
-                while await here.judge.get_param("/amcl/initial_pose_x", None) != pose.x:
+                stored = await here.judge.get_param("/amcl/stored_pose")
+                while StoredPose.from_json(stored).kept.pose.x != pose.x:
                     await here.judge.sleep(0.1)
+                    stored = await here.judge.get_param("/amcl/stored_pose")
         await here.judge.set_param("/amcl/laser_likelihood_max_dist", 0.001)
         await here.judge.set_param("/amcl/laser_z_rand", 1e6)
         yield here
