@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from playwright.async_api import Page, ViewportSize, async_playwright
 from support.browser import CHROMIUM
-from support.demo import Demo, run_headless, running_demo
+from support.demo import LIGHT, Demo, run_headless, running_demo
 from support.engine import until
 from support.ports import free_row
 
@@ -91,7 +91,7 @@ async def term_of(page: Page, *, above: int) -> int:
 async def test_key_and_button_kill_the_leading_master() -> None:
     with terminal() as (person, program):
         async with (
-            running_demo(*replicas(), "--seed", 4, stdin=program, start_timeout=START_S) as demo,
+            running_demo(*replicas(), *LIGHT, "--seed", 4, stdin=program, start_timeout=START_S) as demo,
             async_playwright() as playwright,
         ):
             browser = await playwright.chromium.launch(

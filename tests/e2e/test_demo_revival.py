@@ -44,7 +44,10 @@ async def knows_robots(station: StationClient, count: int) -> bool:
 
 
 async def test_killed_parts_return_killed_world_is_named() -> None:
-    async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
+    async with (
+        running_demo("--robots", 2, "--full-stack", 1, "--no-auto") as demo,
+        aiohttp.ClientSession() as session,
+    ):
         station = StationClient(session, demo.page)
         await until(lambda: knows_robots(station, 2), timeout=90, what="the planner knows the robots")
         fleet = await station.fleet()
