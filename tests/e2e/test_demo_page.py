@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import pytest_asyncio
 from playwright.async_api import Browser, Page, ViewportSize, async_playwright
-from support.browser import CHROMIUM
+from support.browser import CHROMIUM, FEW_FRAMES
 from support.demo import Demo, running_demo
 
 from rce_fleet.demo.floor import FLOOR
@@ -72,6 +72,7 @@ async def opened(
     messages: list[str] = []
     page = await browser.new_page(viewport=viewport, color_scheme="light", has_touch=viewport is PHONE)
     try:
+        await page.add_init_script(FEW_FRAMES)
         page.on("console", lambda said: messages.append(said.text) if said.type == "error" else None)
         page.on("pageerror", lambda error: messages.append(str(error)))
         page.set_default_timeout(WAIT_MS)
