@@ -138,8 +138,8 @@ async def test_real_time(make_node: MakeNode) -> None:
         timer = a.timer(0.01, fail_first)
         await asyncio.wait_for(called.wait(), 10)
         timer.stop()
-        rate = a.rate(200.0)
         before = a.time()
+        rate = a.rate(200.0)
         for _ in range(3):
             assert await rate.sleep()
         assert a.time() - before >= 0.014
