@@ -320,7 +320,7 @@ def _closed_by(zones: Iterable[Zone], grid: GridMap) -> frozenset[tuple[int, int
     """Return the moves between cells of a map that some zones do not allow."""
     closed: set[tuple[int, int]] = set()
     for zone in zones:
-        closed |= grid.passable(zone.edges)
+        closed |= grid.adjacent_moves(zone.edges)
         if zone.direction is not None and zone.kind is ZoneKind.ONE_WAY:
             closed |= grid.moves_by(zone.direction.against(grid.columns), zone.cells)
     return frozenset(closed)

@@ -175,7 +175,7 @@ class GridMap:
         """Return whether every cell shares an edge with the one before it."""
         return all(self.adjacent(a, b) for a, b in pairwise(cells))
 
-    def passable(self, moves: Iterable[tuple[int, int]]) -> frozenset[tuple[int, int]]:
+    def adjacent_moves(self, moves: Iterable[tuple[int, int]]) -> frozenset[tuple[int, int]]:
         """Return those of some moves ``(from, to)`` that lead from a cell of the grid to one beside it."""
         return frozenset(
             (start, end)
@@ -185,7 +185,7 @@ class GridMap:
 
     def moves_by(self, offset: int, cells: Iterable[int]) -> frozenset[tuple[int, int]]:
         """Return the moves ``(from, to)`` by a difference of cell numbers that touch some cells."""
-        return self.passable(
+        return self.adjacent_moves(
             move for cell in cells for move in ((cell, cell + offset), (cell - offset, cell))
         )
 

@@ -197,7 +197,7 @@ class Zone:
 
     def closed(self, grid: GridMap) -> frozenset[tuple[int, int]]:
         """Return the moves ``(from, to)`` between cells beside each other that it does not allow."""
-        moves = grid.passable(self.edges)
+        moves = grid.adjacent_moves(self.edges)
         if self.kind == "one_way":
             against = (-1, -grid.columns, 1, grid.columns)[round((self.value or 0.0) / (pi / 2)) % 4]
             moves |= grid.moves_by(against, self.cells)

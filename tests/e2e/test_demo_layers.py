@@ -47,6 +47,6 @@ async def layers_of(page: str, robot: str, wanted: set[str]) -> dict[str, str]:
 )
 async def test_all_layers_of_a_standing_robot_are_shown(options: tuple[str, ...]) -> None:
     more = ("--core-port", free_port()) if "multi" in options else ()
-    async with running_demo(*options, *more, "--robots", 1, "--no-auto") as demo:
-        missing = await layers_of(demo.page, "Robot1", WITHOUT_GOAL)
+    async with running_demo(*options, *more, "--robots", 2, "--no-auto") as demo:
+        missing = await layers_of(demo.page, "Robot2", WITHOUT_GOAL)
         assert not missing, (missing, demo.output())

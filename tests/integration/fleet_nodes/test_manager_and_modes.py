@@ -85,3 +85,21 @@ async def test_modes_and_zones_survive_the_planner(tmp_path: Path) -> None:
 
         await until(is_out)
         assert (await fleet.ask("GET", "/robots/Robot2")).body["reason"] == "flat, by eve"
+
+
+async def test_a_task_goes_to_the_robot_that_need_not_drive_around_a_one_way_zone(tmp_path: Path) -> None:
+    """Cell 4 is three cells from Robot2, but against the zone's direction; around it are five."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+
+        async def are_ready() -> bool:
+            robots = (await state_of(fleet))["robots"]
+            return bool(robots == {"Robot1": "automatic", "Robot2": "automatic"})
+
+        await until(are_ready)
+        aisle = {"kind": "one_way", "cells": [1, 2, 3, 4, 5, 6], "value": 0.0}
+        async with asyncio.timeout(LONGEST_S):
+            while (await fleet.ask("PUT", "/zones/aisle", aisle)).status != 201:
+                await asyncio.sleep(0.2)
+        created = await fleet.ask("POST", "/tasks", {"stops": [{"cell": 4}]})
+        task = await fleet.until_state(created.body["id"], "done")
+        assert task["robot_assigned"] == "Robot1"

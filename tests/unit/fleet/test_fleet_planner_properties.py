@@ -29,7 +29,7 @@ JUMP_SETTLE_TIME = FleetSettings().jump_settle_time
 FARTHER_THAN_IT_DRIVES = 5.0
 """Metres, although some poses get lost."""
 STEPS_AT_REST = 300
-"""Steps in which nothing changes, after which nothing will: half a minute."""
+"""Steps in which nothing changes, after which a run ends: half a minute."""
 STOPPING_DISTANCE = 3.0
 """Metres in which a robot stops although messages are late and get lost."""
 
