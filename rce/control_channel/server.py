@@ -12,6 +12,7 @@ import msgspec
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
+from rce.aio.tasks import finish
 from rce.control import (
     ACCEPTED_VERSIONS,
     CONTROL_VERSION,
@@ -189,6 +190,9 @@ class ControlServer:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        await finish(self._close())
+
+    async def _close(self) -> None:
         assert self._server is not None
         if self._watcher is not None:
             self._watcher.cancel()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self, cast
 
 from rce.aio.servers import close_servers, open_server
-from rce.aio.tasks import BackgroundTasks
+from rce.aio.tasks import BackgroundTasks, finish
 from rce.guard import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
@@ -106,6 +106,11 @@ class HttpServer:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        # To its end: several parts of a program may each cancel it when they fail at the same time, and a
+        # connection that stayed open would be answered by an application that has ended.
+        await finish(self._close())
+
+    async def _close(self) -> None:
         assert self._server is not None
         await close_servers([self._server])
         if self._gate is not None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import shlex
 import shutil
 import socket
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
@@ -22,12 +20,11 @@ from rce.config.store_address import DEFAULT_PREFIX
 from rce.masters import split_addresses
 from rce.own_process import end_signals
 from rce.services.units import SYSTEM_STATE, Role
-from rce.supervision.process import end_with
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
 from rce.tls.folder import AUTHORITY, CertificateFolder
 from rce_master.cli.client import run
-from rce_master.cluster.files import CERTIFICATE, Machine, find_etcd, read_config
+from rce_master.cluster.files import CERTIFICATE, Machine, read_config
 from rce_master.cluster.joining import (
     check_place,
     cluster_client,
@@ -35,10 +32,10 @@ from rce_master.cluster.joining import (
     hint,
     remove_member,
     request_membership,
-    until_ends,
     wait_for_vote,
 )
 from rce_master.cluster.members import ClusterError
+from rce_master.cluster.process import find_etcd, start_etcd, until_ends
 from rce_master.cluster.recovery import read_machine
 from rce_master.cluster.recovery import recover as recover_alone
 from rce_master.cluster.report import make_report
@@ -267,21 +264,11 @@ class _Local:
             typer.echo(f"when there is a user, start the master: systemctl {scope}start rce-master")
 
     async def _run_etcd(self, steps: Callable[[], Awaitable[Sequence[Member]]]) -> None:
-        process = await asyncio.create_subprocess_exec(
-            *(find_etcd(), "--config-file", str(self.machine.config)),
-            stdin=asyncio.subprocess.DEVNULL,
-            preexec_fn=partial(end_with, os.getpid()),
-        )
+        process = await start_etcd(self.machine.config)
         loop = asyncio.get_running_loop()
         ending = asyncio.Event()
-
-        def end() -> None:
-            ending.set()
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()
-
         for number in end_signals():
-            loop.add_signal_handler(number, end)
+            loop.add_signal_handler(number, ending.set)
 
         async def become_member() -> None:
             members = await steps()
@@ -294,12 +281,7 @@ class _Local:
             )
             typer.echo(f"etcd ready: {self.machine.client}")
 
-        try:
-            code = await until_ends(process.wait(), become_member)
-        finally:
-            if process.returncode is None:
-                end()
-                await process.wait()
+        code = await until_ends(process, ending, become_member)
         if not ending.is_set():
             raise ClusterError(f"etcd ended with exit code {code}; its output says why")
 

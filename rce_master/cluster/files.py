@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
-import subprocess
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +11,6 @@ import yaml
 from rce.tls.choice import ENGINE
 from rce.tls.folder import CertificateFolder
 from rce_master.cluster.members import ClusterError
-from rce_master.store.etcd.client import MIN_VERSION
 from rce_master.store.etcd.layout import MAX_OPERATIONS
 
 if TYPE_CHECKING:
@@ -25,7 +21,6 @@ if TYPE_CHECKING:
 
 CERTIFICATE = ENGINE
 """Name of the certificate that each machine of a cluster shows; each has its own."""
-_VERSION = re.compile(r"etcd Version: (\d+)\.(\d+)")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}")
 _KEYS = {"name", "advertise-client-urls", "initial-advertise-peer-urls", "initial-cluster"}
 """What a configuration must have."""
@@ -235,25 +230,3 @@ def read_config(path: Path) -> dict[str, Any]:
             f"{path} is not a configuration of rce cluster: it lacks {', '.join(sorted(_KEYS))}"
         )
     return dict(document)
-
-
-def find_etcd() -> str:
-    """Return the path of etcd.
-
-    Raises:
-        ClusterError: It is not installed, or too old.
-    """
-    program = shutil.which("etcd")
-    if program is None:
-        raise ClusterError("etcd is not installed; install release 3.4 or later (Debian: etcd-server)")
-    done = subprocess.run([program, "--version"], check=False, capture_output=True, text=True)  # noqa: S603 - no input
-    found = _VERSION.search(done.stdout)
-    if found is None:
-        raise ClusterError(
-            f"{program} --version does not tell a version of etcd: {json.dumps(done.stdout[:80])}"
-        )
-    version = int(found[1]), int(found[2])
-    if version < MIN_VERSION:
-        needed = ".".join(map(str, MIN_VERSION))
-        raise ClusterError(f"{program} is version {found[1]}.{found[2]}; version {needed} or later is needed")
-    return program

@@ -24,7 +24,7 @@ from rce_master.cluster.members import (
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdError, EtcdRefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Sequence
 
     from rce.tls import Context
     from rce_master.cluster.files import Machine
@@ -244,25 +244,6 @@ def hint(members: Sequence[Member]) -> str:
     losses = voters - quorum(voters)
     survives = f"it survives the loss of {'a machine' if losses == 1 else f'{losses} machines'}"
     return f"{voters} member{'s' * (voters != 1)}; {advice(members) or survives}"
-
-
-async def until_ends(work: Awaitable[int], steps: Callable[[], Awaitable[None]]) -> int:
-    """Run steps beside a program; return its exit code when it ends.
-
-    Args:
-        work: Waits for the program's end.
-        steps: What to do meanwhile; a fault of them is raised at once.
-    """
-    ended = asyncio.ensure_future(work)
-    doing = asyncio.ensure_future(steps())
-    try:
-        await asyncio.wait((ended, doing), return_when=asyncio.FIRST_COMPLETED)
-        if doing.done():
-            doing.result()
-        return await ended
-    finally:
-        doing.cancel()
-        await asyncio.gather(doing, return_exceptions=True)
 
 
 async def _check_all_work(members: Sequence[Member], own: Member | None, tls: Context | None) -> None:

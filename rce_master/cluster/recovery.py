@@ -8,18 +8,17 @@ import os
 import shutil
 import socket
 import time
-from functools import partial
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import yaml
 
-from rce.supervision.process import end_with
 from rce_master.cluster.client import ClusterClient, ask_all
 from rce_master.cluster.engines import forget_masters, known_masters
-from rce_master.cluster.files import Machine, find_etcd, read_config
+from rce_master.cluster.files import Machine, read_config
 from rce_master.cluster.joining import START_S, check_ports
 from rce_master.cluster.members import ClusterError, Member, MemberStatus
+from rce_master.cluster.process import end_etcd, start_etcd
 from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
     from rce.tls import Context
 
-END_S = 30.0
-"""How long etcd may take to end."""
 _PAUSE_S = 0.3
 _LOOPBACK = "127.0.0.1"
 _STOP = (
@@ -127,28 +124,14 @@ async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
     config = machine.folder / "etcd.alone.yaml"
     config.write_text(yaml.safe_dump(read_config(machine.config) | own), encoding="utf-8")
     config.chmod(0o644)  # etcd's user reads it, whatever the umask is
-    user, group = _owner(data)
-    process = await asyncio.create_subprocess_exec(
-        *(find_etcd(), "--config-file", str(config)),
-        stdin=asyncio.subprocess.DEVNULL,
-        user=user,
-        group=group,
-        preexec_fn=partial(end_with, os.getpid()),
-    )
+    process = await start_etcd(config, _owner(data))
     try:
         endpoint = _client_of(machine, machine.host, client)
         async with ClusterClient([endpoint], tls=tls) as alone:
             await _until_alone(alone, machine, process)
             await _forget_other_masters(alone, machine, tls)
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
-        try:
-            async with asyncio.timeout(END_S):
-                await process.wait()
-        except TimeoutError:
-            process.kill()
-            await process.wait()
+        await end_etcd(process)
         config.unlink(missing_ok=True)
 
 

@@ -47,6 +47,16 @@ async def test_killed_cluster_command_ends_its_etcd(tmp_path: Path) -> None:
             etcd.kill()
 
 
+async def test_ended_cluster_command_does_not_wait_for_an_etcd_that_hangs(tmp_path: Path) -> None:
+    """One that leads may wait many minutes for a member whose machine was lost."""
+    init = Init(tmp_path, "--no-tls")
+    await init.start()
+    (etcd,) = psutil.Process(init.program.pid).children()
+    etcd.suspend()
+    assert await init.program.stop() == 0
+    assert not works(etcd)
+
+
 def works(process: psutil.Process) -> bool:
     try:
         return process.status() != psutil.STATUS_ZOMBIE  # it has no parent that waits for it
