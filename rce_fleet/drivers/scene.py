@@ -244,6 +244,10 @@ class Scene(Strict):
             fault = Fault(f"{place}.cell", f"{robot.cell} is not on the map of {len(grid)} cells")
             raise ConfigError(source, [fault])
         x, y = robot.at if robot.at is not None else grid.centre(robot.cell or 0)
+        if grid.cell_at(x, y) is None and not self._has_floor_at(x, y, world):
+            left, low, right, high = world.walls.bounds
+            floor = f"the floor, from ({left:g}, {low:g}) to ({right:g}, {high:g})"
+            raise ConfigError(source, [Fault(f"{place}.at", f"({x:g}, {y:g}) is outside of {floor}")])
         if world.is_solid(x, y, model.radius):
             fault = Fault(
                 place, f"({x:g}, {y:g}) is nearer to a wall or box than the hull's {model.radius:g} m"
@@ -253,6 +257,13 @@ class Scene(Strict):
             world.place_robot(robot.id, Pose(x, y, robot.yaw), model)
         except (FleetError, ValueError) as error:
             raise ConfigError(source, [Fault(place, str(error))]) from error
+
+    def _has_floor_at(self, x: float, y: float, world: World) -> bool:
+        """Return whether a point beside the cells has a floor: inside of walls, or if nothing is around."""
+        if not self.map and self.enclosed is False:
+            return True
+        left, low, right, high = world.walls.bounds
+        return left <= x <= right and low <= y <= high
 
     def _place_light_robots(self, world: World, faults: list[Fault]) -> None:
         """Put light robots into a world; note if one has no room."""

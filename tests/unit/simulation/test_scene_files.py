@@ -119,6 +119,10 @@ def test_a_bad_scene_names_the_place(tmp_path: Path, text: str, words: str) -> N
         ("robots: [{id: R, cell: 1, override: {drive: {sped: 1}}}]", "did you mean 'speed'"),
         ("robots: [{id: R, cell: 1, sensor: radar}]", r"robots\[0\]: the robot has no sensor 'radar'"),
         ("robots: [{id: R, at: [0.1, 4]}]", r"robots\[0\]: \(0.1, 4\) is nearer to a wall"),
+        (
+            "robots: [{id: R, at: [13, 4]}]",
+            r"robots\[0\].at: \(13, 4\) is outside of the floor, from \(-0.1, -0.1\) to \(8.1, 8.1\)",
+        ),
         ("robots: [{id: R, at: [1, 1]}, {id: S, at: [1.2, 1]}]", r"robots\[1\]: .* R is in the way"),
         ("robots: [{id: R, at: [4, 4]}]\nboxes: [{id: b, at: [4, 4]}]", r"boxes\[0\]: .* R is in the way"),
     ],
@@ -127,6 +131,11 @@ def test_a_scene_that_cannot_be_built_says_why(tmp_path: Path, text: str, words:
     scene = load_scene(write(tmp_path, text))
     with pytest.raises(ConfigError, match=words):
         scene.build()
+
+
+def test_robots_may_stand_beside_the_cells_of_a_floor_without_walls_around(tmp_path: Path) -> None:
+    scene = load_scene(write(tmp_path, "enclosed: false\nrobots: [{id: R, at: [13, 4]}]"))
+    assert list(scene.build().robots) == ["R"]
 
 
 # Maps
