@@ -2,7 +2,9 @@
 
 import { Fleet } from "./model.js";
 
+const PATH = "/api/v1/live?changes=1&frames=1";
 const LOGIN_ENDED = 1008;
+const BAD_REQUEST = 400; // the answer to a request without a WebSocket, where one would be accepted
 const LONGEST_MS = 8000;
 
 export class Connection {
@@ -10,11 +12,12 @@ export class Connection {
   isLive = false;
   #socket = null;
 
-  // onLink: (whether it is live) => shows it
-  constructor(fleet, layers, onLink) {
+  // onLink: (whether it is live) => shows it; onRefusal: (text) => tells why the station refuses it
+  constructor(fleet, layers, onLink, onRefusal) {
     this.fleet = fleet;
     this.layers = layers;
     this.onLink = onLink;
+    this.onRefusal = onRefusal;
   }
 
   send(message) {
@@ -23,7 +26,7 @@ export class Connection {
 
   open(delay = 500) {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?changes=1&frames=1`);
+    const socket = new WebSocket(`${scheme}://${location.host}${PATH}`);
     socket.binaryType = "arraybuffer";
     this.#socket = socket;
     let opened = false;
@@ -42,8 +45,19 @@ export class Connection {
     socket.addEventListener("close", ({ code }) => {
       if (code === LOGIN_ENDED) return location.replace("/login");
       this.#setLive(false);
+      if (!opened) this.#askWhy();
       setTimeout(() => this.open(opened ? 500 : Math.min(2 * delay, LONGEST_MS)), delay * (0.5 + Math.random()));
     });
+  }
+
+  // A browser does not tell why a WebSocket was refused.
+  async #askWhy() {
+    try {
+      const response = await fetch(PATH);
+      if (response.status > BAD_REQUEST) this.onRefusal((await response.json()).error);
+    } catch {
+      return; // the station is away, or its answer was cut off
+    }
   }
 
   #setLive(live) {

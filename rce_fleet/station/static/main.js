@@ -38,12 +38,14 @@ const layers = new Layers((request) => connection.send(request));
 const view = new View(at("#stage"), fleet, layers);
 const panel = new Panel(fleet);
 const badge = at("#link");
+let refusal = "";
 const connection = new Connection(fleet, layers, (live) => {
   badge.textContent = t(live ? "link.live" : "link.connecting");
   badge.classList.toggle("live", live);
+  if (live && refusal && message.textContent === refusal) say("");
   identify();
   markStale();
-});
+}, (text) => say(refusal = text, true));
 const message = at("#message");
 
 // What the map shows is old.

@@ -13,9 +13,12 @@ from support.browser import BROWSER, CHROMIUM
 from support.ports import free_port
 from unit.station.test_station_view import robot, state
 
+from rce.guard import Places
 from rce.web.server import HttpServer
+from rce_fleet.station import access
 from rce_fleet.station.authentication import StationUser
 from rce_fleet.station.feed import Feed
+from rce_fleet.station.quotas import StationQuotas
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -114,3 +117,19 @@ async def test_a_user_who_is_not_known_at_first_is_asked_for_again() -> None:
         await page.locator("#message.bad", has_text="no master answers").wait_for()
         await page.locator("#person", has_text="guest (viewer)").wait_for()
         await page.locator("#stop-all").wait_for(state="hidden")
+
+
+async def test_a_page_that_is_one_too_many_says_so_until_it_has_a_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A browser does not say why its connection was refused."""
+    quotas = StationQuotas()
+    quotas.pages = Places(each=1, most=1)
+    monkeypatch.setattr(access, "StationQuotas", lambda: quotas)
+    async with opened() as page, Site().serve() as server:
+        with quotas.pages.place("another page"):
+            await page.goto(server.url)
+            await page.locator("#message.bad", has_text="the station's users have 1 pages open").wait_for()
+            assert await page.locator("#link").text_content() == "connecting"
+        await page.locator("#link.live").wait_for()
+        assert await page.locator("#message").text_content() == ""
