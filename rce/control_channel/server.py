@@ -190,6 +190,7 @@ class ControlServer:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # To its end, also if it is cancelled again: what task sets report as they leave needs the master.
         await finish(self._close())
 
     async def _close(self) -> None:

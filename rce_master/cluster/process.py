@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -39,7 +40,7 @@ def find_etcd() -> str:
     found = _VERSION.search(done.stdout)
     if found is None:
         raise ClusterError(
-            f"{program} --version does not print the version of etcd: {done.stdout + done.stderr}"
+            f"{program} --version does not tell a version of etcd: {json.dumps(done.stdout[:80])}"
         )
     version = int(found[1]), int(found[2])
     if version < MIN_VERSION:

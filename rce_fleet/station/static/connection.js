@@ -54,7 +54,9 @@ export class Connection {
   async #askWhy() {
     try {
       const response = await fetch(PATH);
-      if (response.status > BAD_REQUEST) this.onRefusal((await response.json()).error);
+      if (response.status <= BAD_REQUEST) return;
+      const { error } = await response.json();
+      if (!this.isLive) this.onRefusal(error);
     } catch {
       return; // the station is away, or its answer was cut off
     }
