@@ -87,6 +87,24 @@ class Init:
         return await run_to_end(RCE, *words, env=self.env, text="a long password")
 
 
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("etcd Version: 3.3.25", "is version 3.3; version 3.4 or later is needed"),
+        ("\x1b[31mhello" + "o" * 1000, r'does not tell a version of etcd: "\u001b[31mhello'),
+    ],
+)
+async def test_another_program_of_that_name_is_refused(tmp_path: Path, said: str, words: str) -> None:
+    init = Init(tmp_path, "--no-tls")
+    program = tmp_path / "bin" / "etcd"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\necho '{said}'\n")
+    program.chmod(0o755)
+    env = init.env | {"PATH": f"{program.parent}:{init.env['PATH']}"}
+    code, output = await run_to_end(*init.argv, env=env)
+    assert (code, words in output, len(output) < 500) == (1, True, True), output
+
+
 async def test_first_user_is_asked_for_until_there_is_one(tmp_path: Path) -> None:
     """No user can be added over the API before, nor beside a master that leads."""
     init = Init(tmp_path, "--no-tls")
