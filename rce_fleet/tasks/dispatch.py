@@ -17,8 +17,8 @@ from rce_fleet.tasks.idle_ways import IdleWays
 from rce_fleet.tasks.matching_loops import match_rows
 from rce_fleet.tasks.parking import Parking, ParkingCells
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
-from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
+from rce_fleet.tasks.robot_queues import RobotQueues
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
 from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
 from rce_fleet.tasks.travel_loops import measure_ways
@@ -27,7 +27,7 @@ from rce_fleet.tasks.workloads import Workloads
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.charging import ChargerUser
@@ -88,7 +88,7 @@ class Dispatcher:
         self._progress = TaskProgress(book, self.rules.progress, charged=self.rules.battery.full)
         self._conditions = Conditions(book)
         self._assigner = Assigner(self._travel, self.rules.assignment, self.rules.battery)
-        self._queues = Queues(self._travel, self.rules.queue_length)
+        self._queues = RobotQueues(book, self._travel, self.profile, self.rules.queue_length)
         self._ways = IdleWays(self.rules.progress, self._nearest)
         self.chargers = ChargerQueue(self.rules.battery, self._ways)
         self._parking = Parking(self._ways, self.rules.park_after)
@@ -241,11 +241,9 @@ class Dispatcher:
             return None
         profile = self.profile(task.robot)
         if task.state is TaskState.RUNNING:
-            left = self._left(task, facts.cell, profile, now)[0]
-            return None if left == inf else now + left
-        queue = self._queue_of(task.robot, now, facts)
-        queue.tasks = [each for each in self._book.queue_of(task.robot) if each.number <= task.number]
-        left = self._queues.finish(queue)
+            left = self._queues.left(task, facts.cell, profile, now)[0]
+        else:
+            left = self._queues.until_done(task, now, facts)
         return None if left == inf else now + left
 
     def earliest_end(self, task: Task, now: float) -> float | None:
@@ -313,7 +311,7 @@ class Dispatcher:
         working = {robot.id for robot in free}
 
         def begins(task: Task) -> float:
-            return self._begins(task, now, facts.robots.get(task.robot), working)
+            return self._queues.begins(task, now, facts.robots.get(task.robot), working)
 
         ready, avoided = self._conditions.ready, self._progress.avoid.keys()
         for choice in self._assigner.choose(ready, free, now, self._open_chargers(), avoided, begins):
@@ -373,35 +371,6 @@ class Dispatcher:
             task, TaskCause.START, now, f"{robot} begins", robot=robot, target=None, started_at=started
         )
 
-    def _queue_of(self, robot: str, now: float, facts: RobotFacts) -> RobotQueue:
-        """Return a robot's queue without tasks, ready when its present task ends."""
-        profile, task = self.profile(robot), self._book.task_of(robot)
-        cell = facts.cell if facts.cell is not None else 0
-        if task is None:
-            return RobotQueue(robot, profile, cell, 0.0)
-        left, end = self._left(task, cell, profile, now)
-        return RobotQueue(robot, profile, cell if end is None else end, left)
-
-    def _begins(self, task: Task, now: float, robot: RobotFacts | None, working: Collection[str]) -> float:
-        """Return in how many seconds the robot in whose queue a task is will be at its first stop.
-
-        Returns:
-            ``inf`` if it is not known: the robot does not drive now, or gets no task before it has charged.
-        """
-        if robot is None or not robot.is_driven or robot.by_hand or robot.cell is None:
-            return inf
-        present = self._book.task_of(robot.id)
-        if robot.id not in working and (present is None or present.state is not TaskState.RUNNING):
-            return inf
-        queue = self._queue_of(robot.id, now, robot)
-        queue.tasks = self._book.queue_of(robot.id)
-        return self._queues.begin(queue, task)
-
-    def _left(self, task: Task, cell: int, profile: RobotProfile, now: float) -> tuple[float, int | None]:
-        effort = effort_of(task, cell, self._travel, profile)
-        acted = now - task.action.started_at if task.action is not None else 0.0
-        return max(0.0, effort.seconds(profile) - acted), effort.end
-
     def _release_misfits(self, now: float) -> None:
         """Take tasks from robots that do not fit any more, because task or profile was changed."""
         for task in self._book.active_tasks():
@@ -413,28 +382,15 @@ class Dispatcher:
 
     def _fill_queues(self, now: float, facts: FleetFacts) -> None:
         """Give tasks to the queues of busy robots, and take them from robots that cannot do them."""
-        assigned = self._book.queues()
-        for name, tasks in assigned.items():
+        for name, tasks in self._book.queues().items():
             for task in tasks:
                 if reason := self._why_not(task, name, facts.robots.get(name)):
                     self._book.advance(task, TaskCause.RELEASE, now, reason, robot="")
         self._conditions.refresh()  # Another robot may take what was released.
-        queues = []
-        for robot in facts.robots.values():
-            present = self._book.task_of(robot.id)
-            if robot.is_there and present is not None and present.state is TaskState.RUNNING:
-                queue = self._queue_of(robot.id, now, robot)
-                mine = [self._book.tasks[task.number] for task in assigned.get(robot.id, [])]
-                queue.tasks = [task for task in mine if task.state is TaskState.ASSIGNED]
-                if queue.ready < inf:
-                    queues.append(queue)
-        if not queues:
-            return
-        waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
-        waiting = most_urgent_first(waiting, now, self.rules.assignment)
-        for task, name in self._queues.insert(waiting, queues, self._progress.avoid.keys()):
-            text = f"{task.id} is in the queue of {name}"
-            self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
+        if busy := self._queues.busy(now, facts):
+            waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
+            waiting = most_urgent_first(waiting, now, self.rules.assignment)
+            self._queues.fill(waiting, busy, now, self._progress.avoid.keys())
 
     def _why_not(self, task: Task, name: str, robot: RobotFacts | None) -> str:
         """Return why a robot cannot keep a task in its queue; empty if it can."""
