@@ -7,6 +7,7 @@ import { Trail } from "./trail.js";
 const FRAME = 0x50454352;   // "RCEP", as the number at the start of a frame of poses
 const FRAME_HEADER = 16;
 const ROW_BYTES = 20;
+const SEEN = 0.003;         // metres and radians; less is noise of a robot that stands
 
 export class Fleet extends EventTarget {
   map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls, lanes}; row 0 is the lowest
@@ -17,6 +18,7 @@ export class Fleet extends EventTarget {
   engine = null;
   masters = null;      // which of several leads; null: there is one
   selected = null;
+  hasMoved = false;    // whether something moved with the newest poses or models
   models = [];         // of a simulated world: [name, x, y, yaw]
   things = {};         // what they are: {name: ["robot" or "light"], ["box", width, depth] or ["walker", radius]}
   isPaused = false;    // whether the time of the simulated world stands still
@@ -95,6 +97,7 @@ export class Fleet extends EventTarget {
   }
 
   on_poses(message) {
+    this.hasMoved = false;
     for (const [id, [x, y, theta]] of Object.entries(message.poses)) this.#move(this.#robot(id), x, y, theta, performance.now());
   }
 
@@ -109,6 +112,7 @@ export class Fleet extends EventTarget {
     const parts = new Float32Array(buffer);
     const end = Math.min(whole.length, (FRAME_HEADER + whole[1] * ROW_BYTES) / 4);
     const now = performance.now();
+    this.hasMoved = false;
     for (let at = FRAME_HEADER / 4; at < end; at += ROW_BYTES / 4) {
       const robot = this.#byIndex[whole[at]];
       if (!robot) continue;
@@ -120,13 +124,15 @@ export class Fleet extends EventTarget {
 
   #move(robot, x, y, theta, now) {
     const { pose } = robot;
+    robot.seen = now;
+    if (pose && Math.abs(x - pose.x) + Math.abs(y - pose.y) + Math.abs(theta - pose.theta) < SEEN) return;
+    this.hasMoved = true;
     if (pose) {
       pose.x = x;
       pose.y = y;
       pose.theta = theta;
     } else robot.pose = { x, y, theta };
     robot.shown ??= { x, y, theta };
-    robot.seen = now;
     robot.trail.add(x, y);
   }
 
@@ -175,7 +181,10 @@ export class Fleet extends EventTarget {
 
   // The truth of a simulated world: [name, x, y, yaw].
   on_world({ models }) {
-    this.models = models;
+    const before = this.models;
+    const isSame = ([name, x, y, yaw], [other, x0, y0, yaw0]) => name === other && Math.abs(x - x0) + Math.abs(y - y0) + Math.abs(yaw - yaw0) < SEEN;
+    this.hasMoved = models.length !== before.length || !models.every((model, place) => isSame(model, before[place]));
+    if (this.hasMoved) this.models = models;
   }
 
   on_things({ things, paused }) {

@@ -46,6 +46,7 @@ export class View {
     for (const type of ["state", "cells"]) fleet.addEventListener(type, () => this.touch("cells"));
     fleet.addEventListener("changes", () => { if (this.scene.shown.congestion) this.touch("cells"); });
     fleet.addEventListener("poses", () => {
+      if (!fleet.hasMoved) return;
       if (fleet.robots.size <= MANY || this.scene.shown.trails === "all") this.touch("lines");
       this.#wake();
     });

@@ -88,7 +88,8 @@ export class World3d {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     fleet.addEventListener("map", () => this.fit());
     fleet.addEventListener("world", () => { this.models = fleet.models; });
-    for (const type of ["map", "world", "things", "poses", "state", "changes", "selected"]) fleet.addEventListener(type, () => this.wake());
+    for (const type of ["map", "things", "state", "changes", "selected"]) fleet.addEventListener(type, () => this.wake());
+    for (const type of ["poses", "world"]) fleet.addEventListener(type, () => { if (fleet.hasMoved) this.wake(); });
     for (const type of ["pointerdown", "pointermove", "pointerup", "wheel", "keydown"]) canvas.addEventListener(type, () => this.wake());
     new ResizeObserver(() => { if (this.follows) this.fit(); this.wake(); }).observe(canvas);
   }

@@ -21,6 +21,7 @@ from rce_fleet.station.planner_client import PlannerUnavailableError
 from rce_fleet.station.recording import Recorder, Records
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
+from rce_fleet.station.world_link import states_text
 
 if TYPE_CHECKING:
     from playwright.async_api import Browser, Page, Route
@@ -307,6 +308,53 @@ async def test_the_page_fits_a_phone() -> None:
                 .map(e => e.outerHTML)"""
         )
         assert nameless == []
+
+
+async def test_views_rest_while_robots_stand() -> None:
+    """Poses and places that come again, or with the noise of a robot that stands, are not drawn."""
+    async with site() as made:
+        page = await made.open()
+        made.feed.pages.send("world", states_text([["Box1", 2.0, 2.0, 0.0]]))
+        await page.locator("#view-world").click()
+        await page.evaluate(
+            """() => {
+                const { view, world } = rceFleet;
+                for (const drawing of [view, world]) {
+                    const draw = drawing.draw.bind(drawing);
+                    drawing.count = 0;
+                    drawing.draw = (...given) => { drawing.count++; draw(...given); };
+                }
+                rceFleet.counts = () => [view.count, world.count];
+                rceFleet.heard = () => rceFleet.fleet.robots.get("Robot1").seen;
+            }"""
+        )
+
+        async def say(x: float, box: float) -> list[int]:
+            """Send poses and places; return how many frames are drawn within the second after it."""
+            heard = await page.evaluate("rceFleet.heard()")
+            before = await page.evaluate("rceFleet.counts()")
+            made.view.on_pose("Robot1", pose(x, 4.5, 0.0))
+            made.feed.on_pose("Robot1")
+            made.feed.send_poses(time.monotonic() + 1000.0)
+            made.feed.pages.send("world", states_text([["Box1", box, 2.0, 0.0]]))
+            await page.wait_for_function("heard => rceFleet.heard() > heard", arg=heard)
+            await asyncio.sleep(1.0)
+            return [
+                now - was for now, was in zip(await page.evaluate("rceFleet.counts()"), before, strict=True)
+            ]
+
+        async with asyncio.timeout(WAIT_MS / 1000):
+            while any(await say(4.5, 2.0)):
+                pass
+        assert await say(4.501, 2.001) == [0, 0]
+        flat, deep = await say(4.7, 2.0)
+        assert flat
+        assert deep
+        async with asyncio.timeout(WAIT_MS / 1000):
+            while any(await say(4.7, 2.0)):
+                pass
+        flat, deep = await say(4.7, 2.5)
+        assert (flat, deep > 0) == (0, True)
 
 
 async def test_the_world_is_drawn_in_three_dimensions() -> None:
