@@ -42,7 +42,7 @@ OTHERS = {
         ("simulation", "--quick"),
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
-    "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("planning",)),
+    "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("batches",), ("planning",)),
     "scale": (("scale",), ("store",)),
 }
 """Other programs by part; each prints and saves its own figures. :data:`WITHOUT_ENGINE` need no engine."""

@@ -15,6 +15,7 @@
     +-- InvariantError      the planner's records contradict each other: a bug
     +-- ZoneError           a zone that cannot be on the map
     +-- PlanWorkerError     the process that makes plans ended twice over one plan
+    +-- BatchWorkerError    the process that looks for better queues gave no answer
     +-- TaskError           a request about a task that was not carried out
     |   +-- TaskRefusedError           the task cannot be carried out, or not be changed now
     |   +-- UnknownTaskError           there is no such task
@@ -222,6 +223,10 @@ class PlanWorkerError(FleetError):
             f"plan {self.number} for {self.robots} robots was not made: the process that makes plans ended"
             f" twice over it ({self.status}); read its output, and check that the container has enough memory"
         )
+
+
+class BatchWorkerError(FleetError):
+    """The process that looks for better queues gave no answer."""
 
 
 class LogError(FleetError):

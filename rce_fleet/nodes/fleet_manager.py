@@ -29,6 +29,7 @@ from rce_fleet.manager.manager import FleetManager
 from rce_fleet.manager.requests import FleetRequest, Router
 from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
 from rce_fleet.manager.zones import zone_fields
+from rce_fleet.nodes import batch_worker
 from rce_fleet.nodes.fleet_facts import FactKeeper
 from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, read_grid
@@ -169,6 +170,8 @@ class ManagerNode:
         node.log.info("the fleet manager has %d open tasks", self._manager.book.open_count)
         async with asyncio.TaskGroup() as tasks:
             others = [tasks.create_task(self._follow_planner()), tasks.create_task(self._look_around())]
+            if (every := self._parameters.improve_every) and batch_worker.is_available():
+                others.append(tasks.create_task(batch_worker.improve_queues(self._manager, node.log, every)))
             is_compiling = False
             while not self.successor and await node.sleep(STEP_S):
                 await self._step()

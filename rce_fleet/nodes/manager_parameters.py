@@ -77,6 +77,8 @@ class ManagerParameters:
         unreachable_after: So does one to whose goal no path has led for this long.
         load_lost_after: A task whose load is on a robot that cannot continue fails after this time.
         queue_length: Most tasks in the queue of a busy robot.
+        improve_every: Time from one search for better queues to the next, if OR-Tools is installed; 0: no
+            search.
         park_after: An idle robot goes out of the way after this time.
         energy_weight: What a task costs a robot whose usable energy it takes, seconds of way.
         fairness_weight: What a robot that has worked all the time is dearer than one that has not.
@@ -93,6 +95,7 @@ class ManagerParameters:
     unreachable_after: float = field(default=20.0, metadata=_LEAST_ZERO)
     load_lost_after: float = field(default=3600.0, metadata=_LEAST_ZERO)
     queue_length: int = field(default=3, metadata=_LEAST_ZERO)
+    improve_every: float = field(default=5.0, metadata=_LEAST_ZERO)
     park_after: float = field(default=5.0, metadata=_LEAST_ZERO)
     energy_weight: float = field(default=60.0, metadata=_WEIGHT)
     fairness_weight: float = field(default=30.0, metadata=_WEIGHT)

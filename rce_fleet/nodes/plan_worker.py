@@ -39,6 +39,7 @@ from rce_fleet.coordination.rerouting import Rerouting
 from rce_fleet.coordination.settings import COMPILED_EFFORT, PLAN_TIMEOUT
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
+from rce_fleet.nodes.worker_process import ask, end, frame, how_ended, receive, requests_of
 from rce_fleet.planning.path_improvement import PATH_IMPROVEMENT_KERNELS
 from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
 from rce_fleet.planning.rerouting import REROUTING_KERNELS
@@ -49,8 +50,6 @@ if TYPE_CHECKING:
 
 DRIVING_KERNELS = (*REROUTING_KERNELS, *PATH_IMPROVEMENT_KERNELS)
 """Loops for robots that drive, beside those of the default planner."""
-_LENGTH = 4
-"""Bytes of the length in front of each message."""
 _ENDING_S = 5.0
 """How long a process whose output ended may take to end."""
 _CACHE_VARIABLE = "NUMBA_CACHE_DIR"
@@ -148,7 +147,7 @@ class PlanWorker:
                 await self._next.wait()
                 self._next = await self._spawn(compiled=True)
                 if not await _is_ready(self._next):
-                    status = _how_ended(await self._next.wait())
+                    status = how_ended(await self._next.wait())
                     self._next = None
                     self._log.warning(
                         "plans are made without compiled loops: their process ended (%s)", status
@@ -245,44 +244,22 @@ class PlanWorker:
         return await asyncio.create_subprocess_exec(*command, stdin=PIPE, stdout=PIPE, env=variables)
 
     async def _end(self, grace: float = 0.0) -> str:
-        """End the process, after ``grace`` seconds; return how it ended, in words.
-
-        A process that ends by itself needs the grace: to kill it would take its status from asyncio.
-        """
+        """End the process, after ``grace`` seconds; return how it ended, in words."""
         process, self._process = self._process, None
-        if process is None:
-            return "it was ended"
-        try:
-            async with asyncio.timeout(grace):
-                status = await process.wait()
-        except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            status = await process.wait()
-        return _how_ended(status)
+        return "it was ended" if process is None else await end(process, grace)
 
     async def _ask(self, request: PlanRequest) -> PlanResult:
         process = self._process or await self._start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(_frame(msgspec.msgpack.encode(request)))
-        await process.stdin.drain()
-        length = int.from_bytes(await process.stdout.readexactly(_LENGTH))
-        return msgspec.msgpack.decode(await process.stdout.readexactly(length), type=PlanResult)
+        return msgspec.msgpack.decode(await ask(process, msgspec.msgpack.encode(request)), type=PlanResult)
 
 
 async def _is_ready(process: Process) -> bool:
     """Wait until a process has its compiled loops; return False if it ended instead."""
-    assert process.stdout is not None
     try:
-        await process.stdout.readexactly(_LENGTH)
+        await receive(process)
     except asyncio.IncompleteReadError:
         return False
     return True
-
-
-def _how_ended(status: int) -> str:
-    return f"signal {-status}" if status < 0 else f"status {status}"
 
 
 def is_large(robots: int, cells: int) -> bool:
@@ -299,17 +276,17 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
     compiled = is_available()
     if compiled:
         planners[DEFAULT_PLANNER] = load_compiled()
-        results.write(_frame(b""))
+        results.write(frame(b""))
         results.flush()
     gc.collect()
     gc.freeze()  # Compiled loops are many objects: a full collection would take longer than most plans.
-    while len(head := requests.read(_LENGTH)) == _LENGTH:
-        request = msgspec.msgpack.decode(requests.read(int.from_bytes(head)), type=PlanRequest)
+    for payload in requests_of(requests):
+        request = msgspec.msgpack.decode(payload, type=PlanRequest)
         if compiled:  # compiled loops do so much more in the same time
             request = replace(request, effort=max(request.effort, COMPILED_EFFORT))
         try:
             if request.improve_seconds and not compiled:  # too slow to find anything in the time
-                results.write(_frame(msgspec.msgpack.encode(nothing_better(request))))
+                results.write(frame(msgspec.msgpack.encode(nothing_better(request))))
                 results.flush()
                 continue
             if not compiled and request.copy is None and is_large(len(request.robots), 0):
@@ -321,7 +298,7 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
             traceback.print_exc()
             planners.pop(request.planner, None)
             result = failed_plan(request, f"{type(error).__name__}: {error}")
-        results.write(_frame(msgspec.msgpack.encode(result)))
+        results.write(frame(msgspec.msgpack.encode(result)))
         results.flush()
 
 
@@ -355,10 +332,6 @@ def end_with_input() -> None:
     while os.read(sys.stdin.fileno(), 1024):
         pass
     os._exit(0)
-
-
-def _frame(payload: bytes) -> bytes:
-    return len(payload).to_bytes(_LENGTH) + payload
 
 
 def main() -> None:

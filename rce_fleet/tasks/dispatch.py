@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, misfit
+from rce_fleet.tasks.batches import Batch, Batches
 from rce_fleet.tasks.charging import ChargerQueue
 from rce_fleet.tasks.conditions import Conditions
 from rce_fleet.tasks.energy import BatteryLevels, driven, effort_of
@@ -98,6 +99,9 @@ class Dispatcher:
         self._profiles: dict[str, RobotProfile] = {}
         """Of robots for which zones count."""
         self._queues_due = -inf
+        self._batches = Batches(self._travel, self.rules.assignment, self.rules.queue_length)
+        self._found: tuple[Batch, list[list[int]]] | None = None
+        """Better queues that the next look at the queues takes over."""
         self._explained = 0
         self._facts: FleetFacts | None = None
         self._fastest = self.rules.profile
@@ -195,6 +199,33 @@ class Dispatcher:
         yield
         if self._begin_part(facts):
             self._explain(facts, now)
+
+    def batch(self, now: float, facts: FleetFacts) -> Batch | None:
+        """Return some robots whose queues may be better; others each time, if there are many.
+
+        Args:
+            now: Seconds since 1970.
+            facts: What is known of the robots.
+        """
+        queued = self._book.queues().keys()
+        if not queued or facts.grid is None or not facts.is_live:
+            return None
+        self._queues.begin_step()
+        self._take_map(facts)
+        busy = [robot for robot in facts.robots.values() if self._queues.is_busy(robot)]
+        queues = self._queues.busy(now, self._batches.choose(busy, queued, facts.grid))
+        tasks = {queue.robot: self._book.task_of(queue.robot) for queue in queues}
+        present = {robot: task.number for robot, task in tasks.items() if task is not None}
+        return self._batches.make(queues, present, now, self._progress.avoid.keys())
+
+    def adopt(self, batch: Batch, routes: list[list[int]]) -> None:
+        """Take better queues over in the next step, as far as the robots have the same tasks then.
+
+        Args:
+            batch: What they were found for.
+            routes: The tasks of each robot, by their numbers in the batch's problem.
+        """
+        self._found, self._queues_due = (batch, routes), -inf
 
     def goals(self) -> dict[str, int | None]:
         """Return where robots shall go; None: the robot shall stand still. Others have no goal."""
@@ -386,8 +417,12 @@ class Dispatcher:
             for task in tasks:
                 if reason := self._why_not(task, name, facts.robots.get(name)):
                     self._book.advance(task, TaskCause.RELEASE, now, reason, robot="")
+        if self._found is not None:
+            batch, routes = self._found
+            self._queues.adopt(batch, routes, now, facts.robots, self._progress.avoid.keys())
+            self._found = None
         self._conditions.refresh()  # Another robot may take what was released.
-        if busy := self._queues.busy(now, facts):
+        if busy := self._queues.busy(now, facts.robots.values()):
             waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
             waiting = most_urgent_first(waiting, now, self.rules.assignment)
             self._queues.fill(waiting, busy, now, self._progress.avoid.keys())

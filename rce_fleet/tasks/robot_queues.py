@@ -5,15 +5,17 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
+from rce_fleet.tasks.assignment import misfit
 from rce_fleet.tasks.energy import effort_of
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.task import TaskCause, TaskState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
+    from rce_fleet.tasks.batches import Batch
     from rce_fleet.tasks.book import TaskBook
-    from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+    from rce_fleet.tasks.facts import RobotFacts
     from rce_fleet.tasks.records import RobotProfile
     from rce_fleet.tasks.task import Task
     from rce_fleet.tasks.travel import TravelCosts
@@ -83,16 +85,15 @@ class RobotQueues:
             return inf
         return self._queues.begin(self._queue_of(robot, now), task)
 
-    def busy(self, now: float, facts: FleetFacts) -> list[RobotQueue]:
-        """Return the queues, empty ones too, of robots that do a task whose end is known."""
-        queues = []
-        for robot in facts.robots.values():
-            present = self._book.task_of(robot.id)
-            if robot.is_there and present is not None and present.state is TaskState.RUNNING:
-                queue = self._queue_of(robot, now)
-                if queue.ready < inf:
-                    queues.append(queue)
-        return queues
+    def is_busy(self, robot: RobotFacts) -> bool:
+        """Return whether a robot does a task."""
+        present = self._book.task_of(robot.id)
+        return robot.is_there and present is not None and present.state is TaskState.RUNNING
+
+    def busy(self, now: float, robots: Iterable[RobotFacts]) -> list[RobotQueue]:
+        """Return the queues, empty ones too, of those robots that do a task whose end is known."""
+        queues = (self._queue_of(robot, now) for robot in robots if self.is_busy(robot))
+        return [queue for queue in queues if queue.ready < inf]
 
     def fill(
         self,
@@ -112,6 +113,36 @@ class RobotQueues:
         for task, name in self._queues.insert(tasks, queues, avoided):
             text = f"{task.id} is in the queue of {name}"
             self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
+
+    def adopt(
+        self,
+        batch: Batch,
+        routes: Sequence[Sequence[int]],
+        now: float,
+        robots: Mapping[str, RobotFacts],
+        avoided: Collection[tuple[int, str]],
+    ) -> None:
+        """Give tasks to the queues of other robots, unless one of these has other tasks by now.
+
+        Args:
+            batch: What the routes were found for.
+            routes: The tasks of each robot, by their numbers in the batch's problem.
+            now: Seconds since 1970.
+            robots: What is known of the robots, by name.
+            avoided: Numbers of tasks with robots that gave them up a short time ago.
+        """
+        moves = batch.moves(routes)
+        for name in {name for move in moves for name in (move.source, move.target)}:
+            robot, present = robots.get(name), self._book.task_of(name)
+            if robot is None or present is None or not self.is_busy(robot):
+                return
+            if not batch.is_still(name, present.number, [task.number for task in self._book.queue_of(name)]):
+                return
+        for number, source, target in moves:
+            task = self._book.tasks[number]
+            if not misfit(task, target, self._profile(target)) and (number, target) not in avoided:
+                text = f"{target} is to do it instead of {source}: the tasks of both are done earlier so"
+                self._book.advance(task, TaskCause.ASSIGN, now, text, robot=target)
 
     def _queue_of(self, robot: RobotFacts, now: float) -> RobotQueue:
         """Return a robot's queue, which it begins with when its present task ends."""

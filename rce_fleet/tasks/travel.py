@@ -142,6 +142,30 @@ class TravelCosts:
         if cut_off is not None:
             out[cut_off.take(cells, mode="clip")] = inf
 
+    def write_shortest(
+        self,
+        cells: NDArray[np.int64],
+        goals: Sequence[int],
+        zone_cost: Mapping[str, float] | None,
+        out: Floats,
+    ) -> None:
+        """Write the length of the way from each of some cells to the nearest of some others.
+
+        Args:
+            cells: Where the ways begin, shape (n,).
+            goals: Where they may end; without one all ways are 0.
+            zone_cost: See :meth:`field`.
+            out: Lengths, shape (n,); written.
+        """
+        if len(goals) == 1:
+            self.write_metres(cells, goals[0], zone_cost, out)
+            return
+        out[:] = inf if goals else 0.0
+        each = np.empty_like(out)
+        for goal in goals:
+            self.write_metres(cells, goal, zone_cost, each)
+            np.minimum(out, each, out=out)
+
     def field(self, goal: int, zone_cost: Mapping[str, float] | None = None) -> Floats:
         """Return the length of the way to a cell from each cell, shape (cells,); ``inf`` if there is none.
 

@@ -1,0 +1,210 @@
+"""Queued tasks get other robots if the tasks of both are done earlier so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import pytest
+
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks import batches
+from rce_fleet.tasks.batches import Batch, Move
+from rce_fleet.tasks.dispatch import TaskRules
+from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.records import RobotEntry, RobotProfile
+from rce_fleet.tasks.routing import improve
+from rce_fleet.tasks.task import Task, TaskCause, TaskState
+
+from .conftest import Floor
+
+SPEED = RobotProfile(speed=1.0)
+
+
+def crossed(**order: Any) -> tuple[Floor, Task, Task]:
+    """Return robots whose tasks end in cells 50 and 150, each with a task that is nearer to the other."""
+    floor = Floor(GridMap(1, 200), rules=TaskRules(profile=SPEED))
+    floor.add("Robot1", 0)
+    floor.add("Robot2", 199)
+    floor.go(50)
+    floor.go(150)
+    floor.run(1)
+    near1, near2 = floor.go(60, **order), floor.go(140)
+    for task, robot in ((near1, "Robot2"), (near2, "Robot1")):
+        floor.book.advance(task, TaskCause.ASSIGN, floor.now, "by hand", robot=robot)
+    return floor, near1, near2
+
+
+def batch_of(floor: Floor) -> Batch:
+    batch = floor.dispatcher.batch(floor.now, floor.facts)
+    assert batch is not None
+    return batch
+
+
+def robots_of(floor: Floor, *tasks: Task) -> list[str]:
+    return [floor.task(task).robot for task in tasks]
+
+
+def improved(floor: Floor) -> list[Move]:
+    """Look for better queues and take them over; return the moves that were found."""
+    batch = batch_of(floor)
+    routes = improve(batch.problem, 0.1)
+    if routes is None:
+        return []
+    floor.dispatcher.adopt(batch, routes)
+    floor.run(1)
+    return batch.moves(routes)
+
+
+def test_crossed_tasks_change_their_robots() -> None:
+    floor, near1, near2 = crossed()
+    assert sorted(improved(floor)) == [
+        (near1.number, "Robot2", "Robot1"),
+        (near2.number, "Robot1", "Robot2"),
+    ]
+    assert robots_of(floor, near1, near2) == ["Robot1", "Robot2"]
+    assert {floor.task(task).state for task in (near1, near2)} == {TaskState.ASSIGNED}
+    told = [event.text for event in floor.events if event.id == near1.id][-1]
+    assert told == "Robot1 is to do it instead of Robot2: the tasks of both are done earlier so"
+    floor.run_until_ended(near1, near2)
+    assert [floor.task(task).visits[-1].robot for task in (near1, near2)] == ["Robot1", "Robot2"]
+
+
+def test_queues_that_are_as_good_as_can_be_stay() -> None:
+    floor, near1, near2 = crossed()
+    improved(floor)
+    assert improved(floor) == []
+    assert robots_of(floor, near1, near2) == ["Robot1", "Robot2"]
+
+
+def test_a_batch_has_the_times_of_all_tasks_from_all_places() -> None:
+    """One cell is a metre. The robots begin with their tasks now."""
+    floor, near1, near2 = crossed()
+    batch = batch_of(floor)
+    assert batch.robots == ("Robot1", "Robot2")
+    assert batch.queues == ((near2.number,), (near1.number,))
+    problem = batch.problem
+    assert problem.ready == [50.0, 49.0]
+    # Rows: ends of the robots' tasks in cells 50 and 150, ends of the tasks in 140 and 60.
+    assert problem.seconds == [[[90.0, 10.0], [10.0, 90.0], [0.0, 80.0], [80.0, 0.0]]]
+    assert problem.queues == [[0], [1]]
+    assert problem.able == [[0, 1], [0, 1]]
+    assert problem.deadlines == [inf, inf]
+
+
+@pytest.mark.parametrize(
+    "order",
+    [{"robot": "Robot2"}, {"capabilities": ("lift",)}, {"payload": 9.0}],
+    ids=["robot", "capabilities", "payload"],
+)
+def test_a_task_stays_where_the_other_robot_cannot_do_it(order: dict[str, Any]) -> None:
+    floor, near1, _ = crossed(**order)
+    able = replace(SPEED, capabilities=("lift",), payload=10.0)
+    floor.book.emit(RobotEntry("Robot2", profile=able), "profile", floor.now)
+    floor.run(1)
+    improved(floor)
+    assert robots_of(floor, near1) == ["Robot2"]
+
+
+def test_a_task_does_not_go_to_a_robot_that_gave_it_up() -> None:
+    floor, near1, _ = crossed()
+    floor.dispatcher.avoid(near1, "Robot1", floor.now)
+    improved(floor)
+    assert robots_of(floor, near1) == ["Robot2"]
+
+
+@pytest.mark.parametrize(("shut", "robot"), [((), "Robot1"), ((55,), "Robot2")])
+def test_a_task_stays_where_no_way_leads_the_other_robot_to_it(shut: tuple[int, ...], robot: str) -> None:
+    floor, near1, near2 = crossed()
+    floor.book.cancel(near2.id, floor.now)
+    floor.facts.shut, floor.facts.map_revision = frozenset(shut), 1
+    improved(floor)
+    assert robots_of(floor, near1) == [robot]
+
+
+def test_a_robot_that_no_way_leads_to_its_tasks_is_left_out() -> None:
+    floor, _, _ = crossed()
+    floor.facts.shut, floor.facts.map_revision = frozenset({55}), 1
+    assert floor.dispatcher.batch(floor.now, floor.facts) is None
+
+
+def ends_a_task(floor: Floor, near1: Task, _near2: Task) -> None:
+    floor.book.cancel(near1.id, floor.now)
+
+
+def adds_a_task(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.book.advance(floor.go(100), TaskCause.ASSIGN, floor.now, "by hand", robot="Robot1")
+
+
+def loses_a_robot(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.facts.robots["Robot1"].state = "silent"
+
+
+def ends_the_present_task(floor: Floor, _near1: Task, _near2: Task) -> None:
+    present = floor.book.task_of("Robot2")
+    assert present is not None
+    floor.book.cancel(present.id, floor.now)
+
+
+@pytest.mark.parametrize("happens", [ends_a_task, adds_a_task, loses_a_robot, ends_the_present_task])
+def test_better_queues_come_too_late(happens: Callable[[Floor, Task, Task], None]) -> None:
+    """Nothing moves between robots that have other tasks by now."""
+    floor, near1, near2 = crossed()
+    batch = batch_of(floor)
+    routes = improve(batch.problem, 0.1)
+    assert routes == [[1], [0]]
+    happens(floor, near1, near2)
+    floor.dispatcher.adopt(batch, routes)
+    floor.run(1)
+    moved = [event for event in floor.events if "instead of" in event.text]
+    assert moved == []
+
+
+def test_a_charging_stop_leaves_its_robot_out() -> None:
+    """Where it ends is not known before a charger is chosen."""
+    floor, _, _ = crossed()
+    charge = floor.book.create(Order((Stop(Action.CHARGE),)), floor.now)
+    floor.book.advance(charge, TaskCause.ASSIGN, floor.now, "by hand", robot="Robot1")
+    assert floor.dispatcher.batch(floor.now, floor.facts) is None
+
+
+def test_few_robots_and_few_profiles_are_in_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those around one with queued tasks; each such robot has its turn."""
+    monkeypatch.setattr(batches, "MOST_ROBOTS", 3)
+    monkeypatch.setattr(batches, "MOST_PROFILES", 1)
+    floor = Floor(GridMap(1, 200), rules=TaskRules(profile=SPEED))
+    for number in range(10):
+        floor.add(f"Robot{number}", 20 * number)
+        floor.go(20 * number + 10, robot=f"Robot{number}")
+    floor.run(1)
+    for robot in ("Robot2", "Robot7"):
+        floor.book.advance(floor.go(100), TaskCause.ASSIGN, floor.now, "by hand", robot=robot)
+    assert [set(batch_of(floor).robots) for _ in range(3)] == [
+        {"Robot1", "Robot2", "Robot3"},
+        {"Robot6", "Robot7", "Robot8"},
+        {"Robot1", "Robot2", "Robot3"},
+    ]
+    floor.book.emit(RobotEntry("Robot8", profile=replace(SPEED, speed=2.0)), "profile", floor.now)
+    floor.run(1)
+    assert {batch_of(floor).robots for _ in range(2)} >= {("Robot7", "Robot6")}
+
+
+@pytest.mark.parametrize("robots", [0, 1, 2])
+def test_without_queued_tasks_of_several_robots_nothing_is_looked_for(robots: int) -> None:
+    floor = Floor(GridMap(1, 200), rules=TaskRules(profile=SPEED))
+    for number in range(robots):
+        floor.add(f"Robot{number}", 20 * number)
+        floor.go(100 + number)
+    floor.run(1)
+    if robots == 1:
+        floor.go(50)
+        floor.run(3)
+    assert floor.dispatcher.batch(floor.now, floor.facts) is None
+
+
+def test_without_a_planner_nothing_is_looked_for() -> None:
+    floor, _, _ = crossed()
+    floor.facts.is_live = False
+    assert floor.dispatcher.batch(floor.now, floor.facts) is None
