@@ -60,9 +60,15 @@ class RobotQueues:
         return max(0.0, effort.seconds(profile) - acted), effort.end
 
     def until_done(self, task: Task, now: float, robot: RobotFacts) -> float:
-        """Return in how many seconds a robot will have done a task in its queue; ``inf`` if it cannot."""
+        """Return in how many seconds a robot will have done a task in its queue.
+
+        Returns:
+            ``inf`` if it cannot, or the task is not in its queue any more.
+        """
         queue = self._queue_of(robot, now)
         numbers = [each.number for each in queue.tasks]
+        if task.number not in numbers:
+            return inf
         del queue.tasks[numbers.index(task.number) + 1 :]
         return self._queues.finish(queue)
 

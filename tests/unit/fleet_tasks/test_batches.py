@@ -72,6 +72,17 @@ def test_crossed_tasks_change_their_robots() -> None:
     assert [floor.task(task).visits[-1].robot for task in (near1, near2)] == ["Robot1", "Robot2"]
 
 
+def test_the_expected_end_of_a_task_that_has_just_moved_is_not_known() -> None:
+    """A request that waited for the journal asks for it with the task as it was before."""
+    floor, near1, near2 = crossed()
+    before = floor.task(near1)
+    assert floor.dispatcher.expected_end(before, floor.now) == floor.now + 49.0 + 90.0
+    improved(floor)
+    assert floor.dispatcher.expected_end(before, floor.now) is None
+    assert floor.dispatcher.expected_end(floor.task(near1), floor.now) == floor.now + 49.0 + 10.0
+    assert floor.dispatcher.expected_end(floor.task(near2), floor.now) == floor.now + 48.0 + 10.0
+
+
 def test_queues_that_are_as_good_as_can_be_stay() -> None:
     floor, near1, near2 = crossed()
     improved(floor)
