@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from rce.control import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch, ToMaster
 
 
-@dataclass(frozen=True, slots=True)
-class Put:
+class Put(Struct, frozen=True):
     """The master desires a container with this specification."""
 
     spec: EndpointSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Patch:
+class Patch(Struct, frozen=True):
     """The master changed its specification of a container."""
 
     patch: SpecPatch
 
 
-@dataclass(frozen=True, slots=True)
-class Drop:
+class Drop(Struct, frozen=True):
     """The master does not desire a container any more."""
 
     id: str
@@ -30,15 +27,13 @@ class Drop:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Sync:
+class Sync(Struct, frozen=True):
     """The master desires exactly these containers."""
 
     specs: tuple[EndpointSpec, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Adopted:
+class Adopted(Struct, frozen=True):
     """A container was found that an earlier manager had started; its environment has reported."""
 
     incarnation_id: str
@@ -46,8 +41,7 @@ class Adopted:
     address: LinkAddress
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
+class Made(Struct, frozen=True):
     """The processes of a new incarnation were started."""
 
     id: str
@@ -55,8 +49,7 @@ class Made:
     address: LinkAddress
 
 
-@dataclass(frozen=True, slots=True)
-class Reported:
+class Reported(Struct, frozen=True):
     """An environment reported."""
 
     id: str
@@ -64,8 +57,7 @@ class Reported:
     status: EndpointStatus
 
 
-@dataclass(frozen=True, slots=True)
-class Changed:
+class Changed(Struct, frozen=True):
     """An environment reported what changed since its last report."""
 
     id: str
@@ -73,15 +65,13 @@ class Changed:
     patch: StatusPatch
 
 
-@dataclass(frozen=True, slots=True)
-class StatusWanted:
+class StatusWanted(Struct, frozen=True):
     """The master misses a container's status."""
 
     id: str
 
 
-@dataclass(frozen=True, slots=True)
-class Faulted:
+class Faulted(Struct, frozen=True):
     """An environment reports a fault for the user."""
 
     id: str
@@ -89,8 +79,7 @@ class Faulted:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Lost:
+class Lost(Struct, frozen=True):
     """An environment is gone, or could not be started (``incarnation_id`` is empty then)."""
 
     id: str
@@ -98,24 +87,21 @@ class Lost:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Removed:
+class Removed(Struct, frozen=True):
     """An incarnation has been removed completely."""
 
     id: str
     incarnation_id: str
 
 
-@dataclass(frozen=True, slots=True)
-class Due:
+class Due(Struct, frozen=True):
     """The pause that :class:`Wait` asked for is over."""
 
     id: str
     ticket: int
 
 
-@dataclass(frozen=True, slots=True)
-class Quit:
+class Quit(Struct, frozen=True):
     """The manager is to end, with all its containers."""
 
 
@@ -137,15 +123,13 @@ Event = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(Struct, frozen=True):
     """Start a new incarnation; answered by :class:`Made` or :class:`Lost`."""
 
     id: str
 
 
-@dataclass(frozen=True, slots=True)
-class Apply:
+class Apply(Struct, frozen=True):
     """Give a specification to an environment."""
 
     id: str
@@ -153,8 +137,7 @@ class Apply:
     spec: EndpointSpec
 
 
-@dataclass(frozen=True, slots=True)
-class ApplyPatch:
+class ApplyPatch(Struct, frozen=True):
     """Give an environment the changes of its specification."""
 
     id: str
@@ -162,8 +145,7 @@ class ApplyPatch:
     patch: SpecPatch
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Struct, frozen=True):
     """End an incarnation, nodes first; finally answered by :class:`Removed`."""
 
     id: str
@@ -172,8 +154,7 @@ class Stop:
     """The reason, for the record of that incarnation."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wait:
+class Wait(Struct, frozen=True):
     """Answer by :class:`Due` after ``delay`` seconds."""
 
     id: str
@@ -181,8 +162,7 @@ class Wait:
     delay: float
 
 
-@dataclass(frozen=True, slots=True)
-class Tell:
+class Tell(Struct, frozen=True):
     """Send a message to the master."""
 
     message: ToMaster

@@ -6,8 +6,9 @@ Commands are values: the modules that handle them define their meaning (``users`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
+
+from msgspec import Struct
 
 from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges, Resources
 
@@ -30,15 +31,13 @@ _NOTHING_REQUESTED = Resources()
 # Users
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddUser:
+class AddUser(Struct, frozen=True, kw_only=True):
     """Make a user; refused if the name exists."""
 
     user: User
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetPassword:
+class SetPassword(Struct, frozen=True, kw_only=True):
     """Change a user's password; ends their tokens."""
 
     name: str
@@ -46,16 +45,14 @@ class SetPassword:
     """argon2 hash."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetRole:
+class SetRole(Struct, frozen=True, kw_only=True):
     """Change a user's role."""
 
     name: str
     role: UserRole
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveUser:
+class RemoveUser(Struct, frozen=True, kw_only=True):
     """Remove a user with all robots, containers and tokens.
 
     What exceeds the work of one command is left with the user: repeat it until the user is gone.
@@ -64,8 +61,7 @@ class RemoveUser:
     name: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddToken:
+class AddToken(Struct, frozen=True, kw_only=True):
     """Keep a bearer token; forgets expired ones of the same user, and a login too many."""
 
     token: Token
@@ -75,16 +71,14 @@ class AddToken:
     """For a robot's token: whether it replaces the existing one."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoteTokenUses:
+class NoteTokenUses(Struct, frozen=True, kw_only=True):
     """Tokens were used."""
 
     used: dict[str, float]
     """By digest, in seconds since 1970."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RevokeToken:
+class RevokeToken(Struct, frozen=True, kw_only=True):
     """Remove a bearer token of a user; ends the sessions that use it."""
 
     user: str
@@ -92,23 +86,20 @@ class RevokeToken:
     """As :attr:`rce_master.state.user_records.Token.id`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RevokeRobotToken:
+class RevokeRobotToken(Struct, frozen=True, kw_only=True):
     """Forget the token of a robot; ends the robot's session."""
 
     user: str
     robot: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveToken:
+class RemoveToken(Struct, frozen=True, kw_only=True):
     """Forget a bearer token."""
 
     digest: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetLimits:
+class SetLimits(Struct, frozen=True, kw_only=True):
     """Change a user's limits."""
 
     user: str
@@ -116,8 +107,7 @@ class SetLimits:
     """By fields of :class:`rce_master.state.user_records.UserLimits`: 0: no limit, None: as for all."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RememberLogin:
+class RememberLogin(Struct, frozen=True, kw_only=True):
     """Keep the mark of a correct password."""
 
     login: KnownLogin
@@ -126,16 +116,14 @@ class RememberLogin:
 # Requests that are repeated
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Once:
+class Once(Struct, frozen=True, kw_only=True):
     """Do a command and keep the answer to its request, both or neither."""
 
     command: Command
     answer: KeptAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ForgetAnswers:
+class ForgetAnswers(Struct, frozen=True, kw_only=True):
     """Forget kept answers that are too old, a part of them if there are many."""
 
     now: float
@@ -145,15 +133,13 @@ class ForgetAnswers:
 # Packages that users bring
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddPackageKey:
+class AddPackageKey(Struct, frozen=True, kw_only=True):
     """Trust a user's key."""
 
     key: PackageKey
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemovePackageKey:
+class RemovePackageKey(Struct, frozen=True, kw_only=True):
     """Stop trusting a user's key."""
 
     user: str
@@ -161,15 +147,13 @@ class RemovePackageKey:
     """As :func:`rce.packages.signing.key_id` names it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddPackage:
+class AddPackage(Struct, frozen=True, kw_only=True):
     """Store a version of a package; the sender of this command has verified it."""
 
     package: UserPackage
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemovePackage:
+class RemovePackage(Struct, frozen=True, kw_only=True):
     """Remove a version of a package; refused while a node needs it."""
 
     user: str
@@ -180,16 +164,14 @@ class RemovePackage:
 # Volumes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveVolume:
+class RemoveVolume(Struct, frozen=True, kw_only=True):
     """Remove a volume with its files; refused while a container has it."""
 
     user: str
     name: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VolumeRemoved:
+class VolumeRemoved(Struct, frozen=True, kw_only=True):
     """A task set has removed the files of a volume."""
 
     process: str
@@ -197,8 +179,7 @@ class VolumeRemoved:
     """``user/name``."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SnapshotTaken:
+class SnapshotTaken(Struct, frozen=True, kw_only=True):
     """A task set took a snapshot of a volume; the sender of this command has seen that masters hold it."""
 
     process: str
@@ -216,16 +197,14 @@ class SnapshotTaken:
     error: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SnapshotLost:
+class SnapshotLost(Struct, frozen=True, kw_only=True):
     """The masters do not hold a snapshot of a volume that the state names, as after a backup was restored."""
 
     volume: str
     snapshot: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VolumeRestored:
+class VolumeRestored(Struct, frozen=True, kw_only=True):
     """A task set has made the files of a volume's snapshot, or could not."""
 
     process: str
@@ -237,15 +216,13 @@ class VolumeRestored:
 # States of nodes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SaveState:
+class SaveState(Struct, frozen=True, kw_only=True):
     """Keep a snapshot of a node's state; its contents are kept already."""
 
     state: SavedState
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveState:
+class RemoveState(Struct, frozen=True, kw_only=True):
     """Remove the saved state of a node."""
 
     user: str
@@ -256,54 +233,47 @@ class RemoveState:
 # Task sets
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskSetArrived:
+class TaskSetArrived(Struct, frozen=True, kw_only=True):
     """A task set connected."""
 
     hello: Hello
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskSetLeft:
+class TaskSetLeft(Struct, frozen=True, kw_only=True):
     """A task set's channel ended."""
 
     process: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusReported:
+class StatusReported(Struct, frozen=True, kw_only=True):
     """A task set reported an endpoint."""
 
     process: str
     status: EndpointStatus
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusPatched:
+class StatusPatched(Struct, frozen=True, kw_only=True):
     """A task set reported what changed of an endpoint."""
 
     process: str
     patch: StatusPatch
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpecRequested:
+class SpecRequested(Struct, frozen=True, kw_only=True):
     """A task set asked for the whole spec of an endpoint, because a patch did not fit its revision."""
 
     process: str
     id: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointGone:
+class EndpointGone(Struct, frozen=True, kw_only=True):
     """A task set ended an endpoint."""
 
     process: str
     id: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FaultReported:
+class FaultReported(Struct, frozen=True, kw_only=True):
     """A task set reported a fault."""
 
     id: str
@@ -312,8 +282,7 @@ class FaultReported:
     """Endpoint id of the robot to notify; empty: all robots of the user."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobotLogin:
+class RobotLogin(Struct, frozen=True, kw_only=True):
     """An authenticated robot wants to connect at a task set."""
 
     process: str
@@ -324,8 +293,7 @@ class RobotLogin:
     """Stored hash of the password that it used; refused if the password has changed since."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobotLeft:
+class RobotLeft(Struct, frozen=True, kw_only=True):
     """A robot's connection ended."""
 
     process: str
@@ -333,8 +301,7 @@ class RobotLeft:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetDraining:
+class SetDraining(Struct, frozen=True, kw_only=True):
     """An operator starts or cancels the drain of a machine."""
 
     machine: str
@@ -342,8 +309,7 @@ class SetDraining:
     draining: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveContainer:
+class MoveContainer(Struct, frozen=True, kw_only=True):
     """An operator has a container handed over to another machine."""
 
     user: str
@@ -353,21 +319,18 @@ class MoveContainer:
     """Its name, or that of its container task set."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Continue:
+class Continue(Struct, frozen=True, kw_only=True):
     """Do more of the work that a command left over (:attr:`rce_master.state.changes.Changes.unfinished`)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tick:
+class Tick(Struct, frozen=True, kw_only=True):
     """Time passed: grace times end, waiting containers are placed."""
 
 
 # Requests of users. ``user`` owns the endpoints; tags are the user's.
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CreateContainer:
+class CreateContainer(Struct, frozen=True, kw_only=True):
     """``CC``."""
 
     user: str
@@ -377,8 +340,7 @@ class CreateContainer:
     """Whether to wait for room if no machine has room now; else the request is refused."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResizeContainer:
+class ResizeContainer(Struct, frozen=True, kw_only=True):
     """``RC``."""
 
     user: str
@@ -386,16 +348,14 @@ class ResizeContainer:
     changes: ResourceChanges
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DestroyContainer:
+class DestroyContainer(Struct, frozen=True, kw_only=True):
     """``DC``."""
 
     user: str
     tag: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddNode:
+class AddNode(Struct, frozen=True, kw_only=True):
     """Start a node in a container."""
 
     user: str
@@ -403,8 +363,7 @@ class AddNode:
     node: NodeSpec
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveNode:
+class RemoveNode(Struct, frozen=True, kw_only=True):
     """Stop a node."""
 
     user: str
@@ -412,8 +371,7 @@ class RemoveNode:
     tag: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetParameter:
+class SetParameter(Struct, frozen=True, kw_only=True):
     """Set a parameter of a container; replaces an existing value."""
 
     user: str
@@ -422,8 +380,7 @@ class SetParameter:
     value: ParameterValue
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeleteParameter:
+class DeleteParameter(Struct, frozen=True, kw_only=True):
     """Delete a parameter of a container."""
 
     user: str
@@ -431,8 +388,7 @@ class DeleteParameter:
     name: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddInterface:
+class AddInterface(Struct, frozen=True, kw_only=True):
     """Make an interface of a robot or a container."""
 
     user: str
@@ -440,8 +396,7 @@ class AddInterface:
     interface: InterfaceSpec
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveInterface:
+class RemoveInterface(Struct, frozen=True, kw_only=True):
     """Remove an interface with its connections."""
 
     user: str
@@ -449,8 +404,7 @@ class RemoveInterface:
     tag: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Connect:
+class Connect(Struct, frozen=True, kw_only=True):
     """Connect two interfaces, each written ``ENDPOINT/INTERFACE``."""
 
     user: str
@@ -458,8 +412,7 @@ class Connect:
     tag_b: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Disconnect:
+class Disconnect(Struct, frozen=True, kw_only=True):
     """Disconnect two interfaces, each written ``ENDPOINT/INTERFACE``."""
 
     user: str

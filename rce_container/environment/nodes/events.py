@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from rce.model import NodeSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Desire:
+class Desire(Struct, frozen=True):
     """Exactly these nodes are desired."""
 
     specs: tuple[NodeSpec, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
+class Made(Struct, frozen=True):
     """The process that :class:`Launch` asked for runs."""
 
     tag: str
@@ -24,8 +23,7 @@ class Made:
     pid: int
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+class Refused(Struct, frozen=True):
     """The process that :class:`Launch` asked for could not be made."""
 
     tag: str
@@ -35,30 +33,26 @@ class Refused:
     """Whether a retry would not help: the package or executable does not exist."""
 
 
-@dataclass(frozen=True, slots=True)
-class Registered:
+class Registered(Struct, frozen=True):
     """A life of a node registered with the ROS core."""
 
     tag: str
     life: int
 
 
-@dataclass(frozen=True, slots=True)
-class Lack:
+class Lack(Struct, frozen=True):
     """Exactly these nodes cannot be launched yet, with the reason as text, by tag."""
 
     texts: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class Beat:
+class Beat(Struct, frozen=True):
     """A message came on a node's heartbeat topic."""
 
     tag: str
 
 
-@dataclass(frozen=True, slots=True)
-class Ended:
+class Ended(Struct, frozen=True):
     """All processes of a life of a node are gone."""
 
     tag: str
@@ -69,8 +63,7 @@ class Ended:
     """How it ended, as text."""
 
 
-@dataclass(frozen=True, slots=True)
-class Restored:
+class Restored(Struct, frozen=True):
     """A life of a node has the state that was kept for it, or will not get it."""
 
     tag: str
@@ -79,8 +72,7 @@ class Restored:
     """Why it was not restored; empty if it was, or there is none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Unsaved:
+class Unsaved(Struct, frozen=True):
     """What keeps the state of a node from being fetched or saved changed."""
 
     tag: str
@@ -89,16 +81,14 @@ class Unsaved:
     """Empty: nothing does any more."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Struct, frozen=True):
     """Time passed."""
 
 
 Event = Desire | Lack | Made | Refused | Registered | Restored | Unsaved | Beat | Ended | Tick
 
 
-@dataclass(frozen=True, slots=True)
-class Launch:
+class Launch(Struct, frozen=True):
     """Start a process; answered by :class:`Made` or :class:`Refused`, and in the end :class:`Ended`."""
 
     tag: str
@@ -106,8 +96,7 @@ class Launch:
     spec: NodeSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Halt:
+class Halt(Struct, frozen=True):
     """End a life of a node by escalation; answered by :class:`Ended`."""
 
     tag: str
@@ -116,23 +105,20 @@ class Halt:
     """The share of the usual grace times that it gets: other nodes wait for it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tell:
+class Tell(Struct, frozen=True):
     """Tell the user."""
 
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Note:
+class Note(Struct, frozen=True):
     """Write a line to the node's log."""
 
     tag: str
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Forget:
+class Forget(Struct, frozen=True):
     """An undesired node has ended completely."""
 
     tag: str
