@@ -1,6 +1,6 @@
 """Looks for better queues beside a fleet manager, if OR-Tools is installed: ``pip install 'rce[routing]'``.
 
-The search takes a part of a second of a processor, so another process does it, with the least priority: the
+The search takes a part of a second of a processor, so another process does it, with a low priority: the
 manager answers meanwhile. It is started once tasks wait in the queues of several robots, and ends with its
 input.
 """
@@ -31,13 +31,13 @@ Routes = list[list[int]]
 
 SEARCH_S = 0.01
 """Seconds of a processor for the search, for each task of a batch."""
-ANSWER_S = 60.0
+ANSWER_S = 120.0
 """A search that takes so long on a busy machine is given up."""
-RESTART_S = 60.0
-"""After the process ended over a batch, no other one is tried for this time."""
+RESTART_S, MOST_RESTART_S = 60.0, 3600.0
+"""After the process failed, no batch is tried for this time; twice as long each time that it fails again."""
 _ENDING_S = 5.0
 """How long a process whose output ended may take to end."""
-_LEAST_PRIORITY = 19
+_NICE = 10
 
 
 def is_available() -> bool:
@@ -51,13 +51,13 @@ async def improve_queues(manager: FleetManager, log: logging.Logger, every: floa
     Args:
         manager: Its queues are changed.
         log: Says once that no better queues are looked for, if the process ends again and again.
-        every: Seconds between two searches.
+        every: Seconds from the end of a search to the next one.
     """
     worker = BatchWorker()
-    has_failed = False
+    pause = 0.0
     try:
         while True:
-            await asyncio.sleep(every)
+            await asyncio.sleep(every + pause)
             dispatcher = manager.dispatcher
             batch = dispatcher.batch(manager.clock(), manager.facts)
             if batch is None:
@@ -65,14 +65,15 @@ async def improve_queues(manager: FleetManager, log: logging.Logger, every: floa
             try:
                 routes = await worker.improve(batch.problem)
             except BatchWorkerError as error:
-                if not has_failed:
-                    has_failed = True
+                if not pause:
                     log.warning("queued tasks keep their robots: %s", error)
-                await asyncio.sleep(RESTART_S)
+                pause = min(MOST_RESTART_S, 2 * pause or RESTART_S)
                 continue
-            has_failed = False
+            pause = 0.0
             if routes is not None and manager.dispatcher is dispatcher:
                 dispatcher.adopt(batch, routes)
+    except Exception:
+        log.exception("queued tasks keep their robots from now on: the search for better queues failed")
     finally:
         await worker.end()
 
@@ -112,7 +113,11 @@ class BatchWorker:
             raise BatchWorkerError(
                 f"the process that searches ended ({status}); see its output on stderr"
             ) from error
-        return msgspec.msgpack.decode(answer, type=Routes | None)
+        try:
+            return msgspec.msgpack.decode(answer, type=Routes | None)
+        except msgspec.MsgspecError as error:
+            await self.end()
+            raise BatchWorkerError(f"the process that searches gave a wrong answer: {error}") from error
 
     async def end(self, grace: float = 0.0) -> str:
         """End the process, after ``grace`` seconds; return how it ended, in words."""
@@ -132,9 +137,9 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
 
 
 def main() -> None:
-    """Search for better queues with the least priority."""
+    """Search for better queues with a low priority."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the node, which then ends this process.
-    os.nice(_LEAST_PRIORITY)
+    os.nice(_NICE)
     with contextlib.suppress(BrokenPipeError):
         serve(sys.stdin.buffer, sys.stdout.buffer)
 

@@ -77,8 +77,8 @@ class ManagerParameters:
         unreachable_after: So does one to whose goal no path has led for this long.
         load_lost_after: A task whose load is on a robot that cannot continue fails after this time.
         queue_length: Most tasks in the queue of a busy robot.
-        improve_every: Time from one search for better queues to the next, if OR-Tools is installed; 0: no
-            search.
+        improve_every: Time from the end of a search for better queues to the next one, if OR-Tools is
+            installed; 0: no search.
         park_after: An idle robot goes out of the way after this time.
         energy_weight: What a task costs a robot whose usable energy it takes, seconds of way.
         fairness_weight: What a robot that has worked all the time is dearer than one that has not.

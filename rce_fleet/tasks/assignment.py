@@ -355,7 +355,15 @@ class Assigner:
     ) -> None:
         """Write the metres to the first stop of a task for each robot that it is for, shape (robots,)."""
         stop = task.next_stop
-        self._travel.write_shortest(group.cells, stop.cells if stop is not None else (), zones, ways)
+        cells = stop.cells if stop is not None else ()
+        if len(cells) == 1:
+            self._travel.write_metres(group.cells, cells[0], zones, ways)
+        else:
+            ways[:] = inf if cells else 0.0
+            each = np.empty_like(ways)
+            for cell in cells:
+                self._travel.write_metres(group.cells, cell, zones, each)
+                np.minimum(ways, each, out=ways)
         if task.order.robot:
             place = group.places.get(task.order.robot)
             way = inf if place is None else ways[place]

@@ -19,6 +19,7 @@ import numpy as np
 from rce_fleet.limits import within
 from rce_fleet.tasks.assignment import misfit
 from rce_fleet.tasks.energy import effort_of
+from rce_fleet.tasks.order import Action
 from rce_fleet.tasks.routing_problem import RoutingProblem
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ MOST_ROBOTS = 24
 """So many robots near to each other are in a batch; in a larger fleet others have their turn in the next."""
 MOST_PROFILES = 4
 """Profiles of the robots in a batch: the times of all tasks are computed for each."""
+LATEST_S = 60.0
+"""Better queues that come so long after their batch was made are not taken over."""
 MOST_WEIGHT = 10
 """What a task of high priority counts, of those that count 1 at least."""
 
@@ -61,15 +64,19 @@ class Batch:
     """Robots and the tasks in their queues at some time.
 
     Attributes:
+        made_at: When it was made, seconds since 1970.
+        map_version: That of the distances.
         robots: Their names.
         present: Number of each robot's present task.
-        queues: Numbers of the tasks in each robot's queue.
+        queues: The tasks in each robot's queue.
         problem: The same as a problem to solve; its tasks are those of the queues, one queue after the other.
     """
 
+    made_at: float
+    map_version: int
     robots: tuple[str, ...]
     present: tuple[int, ...]
-    queues: tuple[tuple[int, ...], ...]
+    queues: tuple[tuple[Task, ...], ...]
     problem: RoutingProblem
 
     def moves(self, routes: Sequence[Sequence[int]]) -> list[Move]:
@@ -78,8 +85,8 @@ class Batch:
         Args:
             routes: The tasks of each robot, by their numbers in the problem.
         """
-        numbers = [number for queue in self.queues for number in queue]
-        source = {number: robot for robot, queue in enumerate(self.queues) for number in queue}
+        numbers = [task.number for queue in self.queues for task in queue]
+        source = {task.number: robot for robot, queue in enumerate(self.queues) for task in queue}
         return [
             Move(number, self.robots[source[number]], self.robots[target])
             for target, route in enumerate(routes)
@@ -87,16 +94,28 @@ class Batch:
             if source[number] != target
         ]
 
-    def is_still(self, robot: str, present: int, queue: Sequence[int]) -> bool:
-        """Return whether a robot has the tasks that it had when the batch was made.
+    def is_still(self, robot: str, present: int, queue: Sequence[Task]) -> bool:
+        """Return whether a robot has the tasks that it had when the batch was made, and none was changed.
 
         Args:
             robot: Its name.
             present: Number of its present task.
-            queue: Numbers of the tasks in its queue, in any order.
+            queue: The tasks in its queue, in any order.
         """
         place = self.robots.index(robot)
-        return self.present[place] == present and set(self.queues[place]) == set(queue)
+        before, now = ({task.number: task.order for task in tasks} for tasks in (self.queues[place], queue))
+        return self.present[place] == present and before == now
+
+
+def is_plannable(task: Task) -> bool:
+    """Return whether it can be told when and where a robot will have done a task.
+
+    That is not known of stops in one of several cells, of stops that charge and of those that people confirm.
+    """
+    return all(
+        len(stop.cells) == 1 and stop.action is not Action.CHARGE and not stop.confirm
+        for stop in task.order.stops
+    )
 
 
 class Batches:
@@ -121,7 +140,7 @@ class Batches:
         """Return robots for the next batch: one with queued tasks, another one each time, and those near it.
 
         Args:
-            robots: Busy robots whose cells are known.
+            robots: Busy robots that take part; their cells are known.
             queued: Names of robots with queued tasks.
             grid: The grid.
         """
@@ -141,16 +160,17 @@ class Batches:
         present: Mapping[str, int],
         now: float,
         avoided: Collection[tuple[int, str]] = (),
+        weak: Collection[str] = (),
     ) -> Batch | None:
         """Return a batch; None if it has no task that could get another robot.
 
         Args:
-            queues: Of busy robots.
+            queues: Of busy robots, with tasks of which :func:`is_plannable` is true.
             present: Number of the present task of each robot, by name.
             now: Seconds since 1970.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
+            weak: Robots that get no tasks of others, as they must charge soon.
         """
-        queues = [queue for queue in queues if self._ends_are_known(queue)]
         profiles: list[RobotProfile] = []
         for queue in queues:
             if queue.profile not in profiles and len(profiles) < MOST_PROFILES:
@@ -161,11 +181,14 @@ class Batches:
             [
                 place
                 for place, queue in enumerate(queues)
-                if not misfit(task, queue.robot, queue.profile) and (task.number, queue.robot) not in avoided
+                if queue.robot not in weak
+                and (task.number, queue.robot) not in avoided
+                and not misfit(task, queue.robot, queue.profile)
             ]
             for task in tasks
         ]
-        if all(len(robots) < 2 for robots in able):  # noqa: PLR2004 - as above
+        owners = [place for place, queue in enumerate(queues) for _ in queue.tasks]
+        if not any(set(robots) - {owner} for robots, owner in zip(able, owners, strict=True)):
             return None
         starts = [queue.cell for queue in queues]
         places = iter(range(len(tasks)))
@@ -182,38 +205,28 @@ class Batches:
             keep=self._rules.keep,
         )
         return Batch(
+            now,
+            self._travel.version,
             tuple(queue.robot for queue in queues),
             tuple(present[queue.robot] for queue in queues),
-            tuple(tuple(task.number for task in queue.tasks) for queue in queues),
+            tuple(tuple(queue.tasks) for queue in queues),
             problem,
-        )
-
-    def _ends_are_known(self, queue: RobotQueue) -> bool:
-        """Return whether it is known where each task of a queue ends, and a way leads there.
-
-        A stop at any charger or parking place has no cell yet.
-        """
-        return all(
-            all(stop.cells for stop in task.order.stops)
-            and effort_of(task, queue.cell, self._travel, queue.profile).end is not None
-            for task in queue.tasks
         )
 
     def _seconds(
         self, tasks: Sequence[Task], starts: Sequence[int], profile: RobotProfile
     ) -> NDArray[np.float64]:
         """Return how long tasks take robots of a profile from each place, shape (robots + tasks, tasks)."""
-        firsts = [stop.cells if (stop := task.next_stop) is not None else () for task in tasks]
+        firsts = [stop.cells[0] if (stop := task.next_stop) is not None else starts[0] for task in tasks]
         tails = [
-            effort_of(task, cells[0] if cells else starts[0], self._travel, profile)
-            for task, cells in zip(tasks, firsts, strict=True)
+            effort_of(task, first, self._travel, profile) for task, first in zip(tasks, firsts, strict=True)
         ]
         # No robot of this profile gets to the end of a task that it cannot do: any cell will do there.
         cells = np.array([*starts, *(starts[0] if tail.end is None else tail.end for tail in tails)])
         seconds = np.full((len(cells), len(tasks)), inf)
         ways = np.empty(len(cells), np.float32)
-        for column, (goals, tail) in enumerate(zip(firsts, tails, strict=True)):
+        for column, (first, tail) in enumerate(zip(firsts, tails, strict=True)):
             if tail.end is not None:
-                self._travel.write_shortest(cells, goals, profile.zone_cost, ways)
+                self._travel.write_metres(cells, first, profile.zone_cost, ways)
                 seconds[:, column] = (ways + tail.metres) / profile.speed + tail.acting
         return seconds

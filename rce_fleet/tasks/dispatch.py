@@ -212,14 +212,17 @@ class Dispatcher:
             return None
         self._queues.begin_step()
         self._take_map(facts)
-        busy = [robot for robot in facts.robots.values() if self._queues.is_busy(robot)]
-        queues = self._queues.busy(now, self._batches.choose(busy, queued, facts.grid))
+        working = [robot for robot in facts.robots.values() if self._queues.takes_part(robot)]
+        chosen = self._batches.choose(working, queued, facts.grid)
+        queues = self._queues.improvable(now, chosen)
         tasks = {queue.robot: self._book.task_of(queue.robot) for queue in queues}
         present = {robot: task.number for robot, task in tasks.items() if task is not None}
-        return self._batches.make(queues, present, now, self._progress.avoid.keys())
+        least = self.rules.battery.sufficient
+        weak = {robot.id for robot in chosen if robot.battery is not None and robot.battery < least}
+        return self._batches.make(queues, present, now, self._progress.avoid.keys(), weak)
 
     def adopt(self, batch: Batch, routes: list[list[int]]) -> None:
-        """Take better queues over in the next step, as far as the robots have the same tasks then.
+        """Take better queues over in the next step, unless something has changed by then.
 
         Args:
             batch: What they were found for.

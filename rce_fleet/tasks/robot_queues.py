@@ -6,8 +6,11 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.tasks.assignment import misfit
+from rce_fleet.tasks.batches import LATEST_S, is_plannable
 from rce_fleet.tasks.energy import effort_of
 from rce_fleet.tasks.queueing import Queues, RobotQueue
+from rce_fleet.tasks.records import AUTOMATIC
+from rce_fleet.tasks.routing_problem import LONGEST_S
 from rce_fleet.tasks.task import TaskCause, TaskState
 
 if TYPE_CHECKING:
@@ -66,11 +69,8 @@ class RobotQueues:
             ``inf`` if it cannot, or the task is not in its queue any more.
         """
         queue = self._queue_of(robot, now)
-        numbers = [each.number for each in queue.tasks]
-        if task.number not in numbers:
-            return inf
-        del queue.tasks[numbers.index(task.number) + 1 :]
-        return self._queues.finish(queue)
+        queue.tasks = [each for each in queue.tasks if each.number <= task.number]
+        return self._queues.finish(queue) if task.number in (each.number for each in queue.tasks) else inf
 
     def begins(self, task: Task, now: float, robot: RobotFacts | None, working: Collection[str]) -> float:
         """Return in how many seconds the robot in whose queue a task is will be at its first stop.
@@ -101,6 +101,18 @@ class RobotQueues:
         queues = (self._queue_of(robot, now) for robot in robots if self.is_busy(robot))
         return [queue for queue in queues if queue.ready < inf]
 
+    def takes_part(self, robot: RobotFacts) -> bool:
+        """Return whether the queue of a robot may be improved: it drives, and its tasks can be planned."""
+        present = self._book.task_of(robot.id)
+        drives = robot.is_driven and not robot.by_hand and self._book.entry(robot.id).mode == AUTOMATIC
+        if present is None or not drives or not self.is_busy(robot):
+            return False
+        return is_plannable(present) and all(map(is_plannable, self._book.queue_of(robot.id)))
+
+    def improvable(self, now: float, robots: Iterable[RobotFacts]) -> list[RobotQueue]:
+        """Return the queues of robots that take part and can do all that is in their queues."""
+        return [queue for queue in self.busy(now, robots) if self._queues.finish(queue) < LONGEST_S]
+
     def fill(
         self,
         tasks: Sequence[Task],
@@ -128,7 +140,7 @@ class RobotQueues:
         robots: Mapping[str, RobotFacts],
         avoided: Collection[tuple[int, str]],
     ) -> None:
-        """Give tasks to the queues of other robots, unless one of these has other tasks by now.
+        """Give tasks to the queues of other robots: all of them, or none if something has changed since.
 
         Args:
             batch: What the routes were found for.
@@ -137,18 +149,22 @@ class RobotQueues:
             robots: What is known of the robots, by name.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
         """
+        if now - batch.made_at > LATEST_S or self._travel.version != batch.map_version:
+            return
         moves = batch.moves(routes)
         for name in {name for move in moves for name in (move.source, move.target)}:
             robot, present = robots.get(name), self._book.task_of(name)
-            if robot is None or present is None or not self.is_busy(robot):
+            if robot is None or present is None or not self.takes_part(robot):
                 return
-            if not batch.is_still(name, present.number, [task.number for task in self._book.queue_of(name)]):
+            if not batch.is_still(name, present.number, self._book.queue_of(name)):
                 return
-        for number, source, target in moves:
-            task = self._book.tasks[number]
-            if not misfit(task, target, self._profile(target)) and (number, target) not in avoided:
-                text = f"{target} is to do it instead of {source}: the tasks of both are done earlier so"
-                self._book.advance(task, TaskCause.ASSIGN, now, text, robot=target)
+        tasks = [self._book.tasks[move.task] for move in moves]
+        for task, move in zip(tasks, moves, strict=True):
+            if misfit(task, move.target, self._profile(move.target)) or (task.number, move.target) in avoided:
+                return
+        for task, move in zip(tasks, moves, strict=True):
+            text = f"moved from {move.source} to {move.target}: the queued tasks together are done earlier"
+            self._book.advance(task, TaskCause.ASSIGN, now, text, robot=move.target)
 
     def _queue_of(self, robot: RobotFacts, now: float) -> RobotQueue:
         """Return a robot's queue, which it begins with when its present task ends."""

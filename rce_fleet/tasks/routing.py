@@ -19,6 +19,8 @@ from ortools.constraint_solver.pywrapcp import (
 )
 from ortools.constraint_solver.routing_enums_pb2 import LocalSearchMetaheuristic
 
+from rce_fleet.tasks.routing_problem import LONGEST_S
+
 if TYPE_CHECKING:
     from rce_fleet.tasks.routing_problem import RoutingProblem
 
@@ -26,8 +28,6 @@ _TICKS = 10
 """The solver counts in whole numbers: so many of them are a second."""
 _MOST_CLOCK = 30
 """Seconds of the clock for a search, however little of the processor it gets."""
-_LONGEST = 1e6
-"""Seconds; tasks that take longer stay where they are."""
 
 
 def improve(problem: RoutingProblem, seconds: float) -> list[list[int]] | None:
@@ -99,7 +99,7 @@ def _count_times(model: RoutingModel, problem: RoutingProblem) -> None:
 
 def _horizon(problem: RoutingProblem) -> int:
     """Return a time at which every route that is possible has ended, in ticks."""
-    finite = (each for table in problem.seconds for row in table for each in row if each < _LONGEST)
+    finite = (each for table in problem.seconds for row in table for each in row if each < LONGEST_S)
     length = max(problem.length, *map(len, problem.queues))
     return ceil(_TICKS * (max(problem.ready) + (length + 1) * max(finite, default=0.0)))
 
@@ -108,7 +108,7 @@ def _register(model: RoutingModel, table: list[list[float]], robots: int, horizo
     """Register how long tasks take from each place; none ends at a robot, and the end is near to all."""
     never = horizon + 1
     rows = [
-        [*[never] * robots, *(round(_TICKS * each) if each < _LONGEST else never for each in row), 0]
+        [*[never] * robots, *(round(_TICKS * each) if each < LONGEST_S else never for each in row), 0]
         for row in table
     ]
     number: int = model.RegisterTransitMatrix([*rows, [never] * (len(table) + 1)])
@@ -126,9 +126,9 @@ def _allow_moves(model: RoutingModel, problem: RoutingProblem) -> None:
     """Let tasks go to robots that may do them; each that gets another robot must save some time."""
     robots, tasks = len(problem.ready), len(problem.weights)
     owners = problem.owners()
-    keep = round(_TICKS * problem.keep)
+    keep = [round(_TICKS * problem.keep * weight) for weight in problem.weights]
     for robot in range(robots):
-        moved = (0 if owners[task] == robot else keep for task in range(tasks))
+        moved = (0 if owners[task] == robot else keep[task] for task in range(tasks))
         cost = model.RegisterUnaryTransitVector([*[0] * robots, *moved, 0])
         model.SetArcCostEvaluatorOfVehicle(cost, robot)
     for task, able in enumerate(problem.able):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+LONGEST_S = 1e6
+"""Seconds; what takes longer counts as impossible."""
+
 
 @dataclass(frozen=True)
 class RoutingProblem:
@@ -15,14 +18,14 @@ class RoutingProblem:
         ready: Seconds until each robot can begin, shape (robots,).
         profiles: Which table of ``seconds`` counts for each robot, shape (robots,).
         seconds: How long each task takes from each place, with the way to its first stop, for each profile,
-            shape (profiles, robots + tasks, tasks); ``inf``: it cannot be done from there.
+            shape (profiles, robots + tasks, tasks). From :data:`LONGEST_S` on it cannot be done from there.
         queues: The tasks of each robot, in order.
         able: The robots that may do each task.
         weights: What a second counts until each task is done, shape (tasks,).
         deadlines: Seconds until each task should be done; ``inf``: at any time; shape (tasks,).
         late: What a second after the deadline counts in addition.
         length: Most tasks of a robot.
-        keep: Seconds that must be saved for each task that gets another robot.
+        keep: Seconds that must be saved, each with the task's weight, for a task that gets another robot.
     """
 
     ready: list[float]

@@ -58,6 +58,7 @@ class TravelCosts:
 
     Attributes:
         epoch: Grows when all distances are forgotten: with each new grid, and with other lanes.
+        version: Grows with each change of the map, that of a cell or a zone too.
     """
 
     def __init__(self) -> None:
@@ -67,6 +68,7 @@ class TravelCosts:
         self._zones: dict[str, Zone] = {}
         self._lanes: LaneGraph | None = None
         self.epoch = 0
+        self.version = 0
         self._graphs: OrderedDict[Costs, Graph] = OrderedDict()
         self._parts: dict[Costs, _Parts] = {}
         self._fields: OrderedDict[tuple[int, Costs], Floats] = OrderedDict()
@@ -101,6 +103,7 @@ class TravelCosts:
             return
         self._stale = {**self._stale, **self._fields} if is_same else {}
         self.epoch += not is_same
+        self.version += 1
         self._lanes = lanes
         self._grid, self._shut, self._revision, self._zones = grid, shut, revision, dict(zones)
         self._graphs.clear()
@@ -141,30 +144,6 @@ class TravelCosts:
         field.take(cells, out=out, mode="clip")
         if cut_off is not None:
             out[cut_off.take(cells, mode="clip")] = inf
-
-    def write_shortest(
-        self,
-        cells: NDArray[np.int64],
-        goals: Sequence[int],
-        zone_cost: Mapping[str, float] | None,
-        out: Floats,
-    ) -> None:
-        """Write the length of the way from each of some cells to the nearest of some others.
-
-        Args:
-            cells: Where the ways begin, shape (n,).
-            goals: Where they may end; without one all ways are 0.
-            zone_cost: See :meth:`field`.
-            out: Lengths, shape (n,); written.
-        """
-        if len(goals) == 1:
-            self.write_metres(cells, goals[0], zone_cost, out)
-            return
-        out[:] = inf if goals else 0.0
-        each = np.empty_like(out)
-        for goal in goals:
-            self.write_metres(cells, goal, zone_cost, each)
-            np.minimum(out, each, out=out)
 
     def field(self, goal: int, zone_cost: Mapping[str, float] | None = None) -> Floats:
         """Return the length of the way to a cell from each cell, shape (cells,); ``inf`` if there is none.

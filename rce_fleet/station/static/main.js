@@ -69,6 +69,7 @@ new AuditPanel(fleet);
 new LayerPanel(fleet, layers, view);
 new Figures();
 const world = new World3d(at("#world"), view.scene, fleet);
+view.changed = () => world.wake();
 const worldPanel = new WorldPanel(world, fleet, operator);
 const masters = new MastersPanel(fleet, operator);
 const replay = new Replay(view, fleet, say);

@@ -9,6 +9,11 @@ const FRAME_HEADER = 16;
 const ROW_BYTES = 20;
 const SEEN = 0.003;         // metres and radians; less is noise of a robot that stands
 
+// How far apart two poses are, metres and radians together.
+function difference(right, up, turn) {
+  return Math.abs(right) + Math.abs(up) + Math.abs(turn - 2 * Math.PI * Math.round(turn / (2 * Math.PI)));
+}
+
 export class Fleet extends EventTarget {
   map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls, lanes}; row 0 is the lowest
   robots = new Map();  // id -> {id, state, reason, cell, goal, plan, granted, replans, pose, seen, trail}
@@ -125,7 +130,7 @@ export class Fleet extends EventTarget {
   #move(robot, x, y, theta, now) {
     const { pose } = robot;
     robot.seen = now;
-    if (pose && Math.abs(x - pose.x) + Math.abs(y - pose.y) + Math.abs(theta - pose.theta) < SEEN) return;
+    if (pose && difference(x - pose.x, y - pose.y, theta - pose.theta) < SEEN) return;
     this.hasMoved = true;
     if (pose) {
       pose.x = x;
@@ -182,7 +187,7 @@ export class Fleet extends EventTarget {
   // The truth of a simulated world: [name, x, y, yaw].
   on_world({ models }) {
     const before = this.models;
-    const isSame = ([name, x, y, yaw], [other, x0, y0, yaw0]) => name === other && Math.abs(x - x0) + Math.abs(y - y0) + Math.abs(yaw - yaw0) < SEEN;
+    const isSame = ([name, x, y, yaw], [other, x0, y0, yaw0]) => name === other && difference(x - x0, y - y0, yaw - yaw0) < SEEN;
     this.hasMoved = models.length !== before.length || !models.every((model, place) => isSame(model, before[place]));
     if (this.hasMoved) this.models = models;
   }

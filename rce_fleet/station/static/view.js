@@ -16,6 +16,7 @@ const LINES_OF_MANY_MS = 500; // the same with more robots than 300
 const CELLS_EVERY_MS = 1000; // congestion is counted again at most this often
 
 export class View {
+  changed = () => {}; // called when robots, or what is drawn with them, may look different
   cursor = null; // cell under the pointer or the keyboard
   meter = { frames: 0, drawn: 0, script_ms: 0, longest_ms: 0 };
   #editor = null;
@@ -45,6 +46,7 @@ export class View {
     for (const type of ["state", "changes", "selected"]) fleet.addEventListener(type, () => this.touch("lines", "overlay", "fleet"));
     for (const type of ["state", "cells"]) fleet.addEventListener(type, () => this.touch("cells"));
     fleet.addEventListener("changes", () => { if (this.scene.shown.congestion) this.touch("cells"); });
+    fleet.addEventListener("control", () => this.touch("fleet", "overlay"));
     fleet.addEventListener("poses", () => {
       if (!fleet.hasMoved) return;
       if (fleet.robots.size <= MANY || this.scene.shown.trails === "all") this.touch("lines");
@@ -157,6 +159,7 @@ export class View {
     if (this.#isDue("lines", now, fleet.robots.size > 300 ? LINES_OF_MANY_MS : LINES_EVERY_MS)) scene.makeLines();
     const moving = scene.moveRobots(seconds);
     if (moving) this.#wake();
+    if (moving || needs.fleet) this.changed();
     if (this.stage.hidden) return;
     if (needs.ground) {
       this.context.clearRect(0, 0, this.ground.width, this.ground.height);

@@ -53,12 +53,12 @@ def processes() -> list[psutil.Process]:
     return [each for each in psutil.Process().children() if "rce_fleet.nodes.batch_worker" in each.cmdline()]
 
 
-async def test_finds_better_queues_with_the_least_priority(worker: BatchWorker) -> None:
+async def test_finds_better_queues_with_a_low_priority(worker: BatchWorker) -> None:
     assert processes() == []
     for _ in range(2):
         assert await worker.improve(CROSSED) == [[1], [0]]
     (process,) = processes()
-    assert process.nice() == 19
+    assert process.nice() == 10
     await worker.end()
     assert not psutil.pid_exists(process.pid)
 
@@ -66,7 +66,7 @@ async def test_finds_better_queues_with_the_least_priority(worker: BatchWorker) 
 async def test_a_process_that_was_killed_is_an_error_and_started_again(worker: BatchWorker) -> None:
     await worker.improve(CROSSED)
     os.kill(processes()[0].pid, signal.SIGKILL)
-    with pytest.raises(BatchWorkerError, match=r"ended \(signal 9\)"):
+    with pytest.raises(BatchWorkerError, match="signal 9"):
         await worker.improve(CROSSED)
     assert await worker.improve(CROSSED) == [[1], [0]]
 
@@ -84,10 +84,11 @@ async def test_a_process_that_hangs_is_ended(worker: BatchWorker, monkeypatch: p
 @pytest.mark.parametrize(
     ("command", "reason"),
     [
-        ((sys.executable, "-c", "import sys; sys.exit(3)"), r"\(status 3\)|failed: .*\(status 3\)"),
+        ((sys.executable, "-c", "import sys; sys.exit(3)"), r"\(status 3\)"),
+        ((sys.executable, "-c", "print('xxxx' * 20000)"), "status 0|wrong answer"),
         (("/nowhere/python",), "failed: .*No such file"),
     ],
-    ids=["ends", "missing"],
+    ids=["ends", "other answer", "missing"],
 )
 async def test_a_process_that_cannot_work_is_an_error(command: tuple[str, ...], reason: str) -> None:
     with pytest.raises(BatchWorkerError, match=reason):
@@ -97,7 +98,7 @@ async def test_a_process_that_cannot_work_is_an_error(command: tuple[str, ...], 
 def test_the_process_ends_with_its_input() -> None:
     """A node that is killed leaves none."""
     command = (sys.executable, "-P", "-m", "rce_fleet.nodes.batch_worker")
-    ended = subprocess.run(command, input=b"", capture_output=True, timeout=60, check=False)
+    ended = subprocess.run(command, input=b"", capture_output=True, timeout=150, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"", b"")
 
 
@@ -134,7 +135,7 @@ async def robots_of_tasks(client: ManagerClient) -> dict[str, str]:
 async def until_moved(client: ManagerClient) -> dict[str, str]:
     """Let the manager take steps until another robot has one of the tasks."""
     before = await robots_of_tasks(client)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(150):
         while (now := await robots_of_tasks(client)) == before:
             await client.manager.step()
             await asyncio.sleep(0.05)
@@ -152,7 +153,7 @@ async def test_a_managers_queues_get_better(client: ManagerClient) -> None:
     assert processes() == []
     await client.manager.commit()
     told = [event["text"] for event in client.journal.events(EventQuery()) if event["id"] == "T3"]
-    assert "instead of Robot2" in told[-1]
+    assert "from Robot2 to Robot1" in told[-1]
 
 
 async def test_a_process_that_always_ends_is_logged_once(

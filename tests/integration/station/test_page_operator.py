@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -329,32 +330,42 @@ async def test_views_rest_while_robots_stand() -> None:
             }"""
         )
 
-        async def say(x: float, box: float) -> list[int]:
-            """Send poses and places; return how many frames are drawn within the second after it."""
-            heard = await page.evaluate("rceFleet.heard()")
-            before = await page.evaluate("rceFleet.counts()")
-            made.view.on_pose("Robot1", pose(x, 4.5, 0.0))
-            made.feed.on_pose("Robot1")
-            made.feed.send_poses(time.monotonic() + 1000.0)
-            made.feed.pages.send("world", states_text([["Box1", box, 2.0, 0.0]]))
-            await page.wait_for_function("heard => rceFleet.heard() > heard", arg=heard)
-            await asyncio.sleep(1.0)
-            return [
-                now - was for now, was in zip(await page.evaluate("rceFleet.counts()"), before, strict=True)
-            ]
+        later = count(1000.0, 10.0)
 
-        async with asyncio.timeout(WAIT_MS / 1000):
-            while any(await say(4.5, 2.0)):
-                pass
-        assert await say(4.501, 2.001) == [0, 0]
-        flat, deep = await say(4.7, 2.0)
-        assert flat
-        assert deep
-        async with asyncio.timeout(WAIT_MS / 1000):
-            while any(await say(4.7, 2.0)):
-                pass
-        flat, deep = await say(4.7, 2.5)
-        assert (flat, deep > 0) == (0, True)
+        async def say(x: float, yaw: float, box: float) -> None:
+            """Send poses and places that the page gets even if they are as before."""
+            heard = await page.evaluate("rceFleet.heard()")
+            made.view.on_pose("Robot1", pose(x, 4.5, yaw))
+            made.feed.on_pose("Robot1")
+            made.feed.send_poses(time.monotonic() + next(later))
+            made.feed.pages.send("world", states_text([["Box1", box, 2.0, yaw]]))
+            await page.wait_for_function("heard => rceFleet.heard() > heard", arg=heard)
+
+        async def frames_after(x: float, yaw: float, box: float) -> list[int]:
+            """Send poses and places; return how many frames are drawn within the second after it."""
+            before = await page.evaluate("rceFleet.counts()")
+            await say(x, yaw, box)
+            await asyncio.sleep(1.0)
+            counts = await page.evaluate("rceFleet.counts()")
+            return [now - was for now, was in zip(counts, before, strict=True)]
+
+        async def rests(x: float, yaw: float, box: float) -> None:
+            async with asyncio.timeout(WAIT_MS / 1000):
+                while any(await frames_after(x, yaw, box)):
+                    pass
+
+        await rests(4.5, 3.141, 2.0)
+        assert await frames_after(4.501, -3.142, 2.001) == [0, 0], "it looks along -x: the turn is small"
+        for moved in ((4.7, 3.141, 2.0), (4.7, 3.141, 2.5)):
+            before = await page.evaluate("rceFleet.counts()")
+            await say(*moved)
+            await page.wait_for_function("before => rceFleet.counts()[1] > before[1]", arg=before)
+            await rests(*moved)
+        before = await page.evaluate("rceFleet.counts()")
+        made.feed.on_control({"Robot1": "an operator"}, {})
+        await page.wait_for_function(
+            "before => rceFleet.counts().every((count, at) => count > before[at])", arg=before
+        )
 
 
 async def test_the_world_is_drawn_in_three_dimensions() -> None:

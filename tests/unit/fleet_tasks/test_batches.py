@@ -67,12 +67,12 @@ def test_crossed_tasks_change_their_robots() -> None:
     assert robots_of(floor, near1, near2) == ["Robot1", "Robot2"]
     assert {floor.task(task).state for task in (near1, near2)} == {TaskState.ASSIGNED}
     told = [event.text for event in floor.events if event.id == near1.id][-1]
-    assert told == "Robot1 is to do it instead of Robot2: the tasks of both are done earlier so"
+    assert told == "moved from Robot2 to Robot1: the queued tasks together are done earlier"
     floor.run_until_ended(near1, near2)
     assert [floor.task(task).visits[-1].robot for task in (near1, near2)] == ["Robot1", "Robot2"]
 
 
-def test_the_expected_end_of_a_task_that_has_just_moved_is_not_known() -> None:
+def test_the_end_of_a_task_that_has_just_moved_is_unknown() -> None:
     """A request that waited for the journal asks for it with the task as it was before."""
     floor, near1, near2 = crossed()
     before = floor.task(near1)
@@ -95,7 +95,7 @@ def test_a_batch_has_the_times_of_all_tasks_from_all_places() -> None:
     floor, near1, near2 = crossed()
     batch = batch_of(floor)
     assert batch.robots == ("Robot1", "Robot2")
-    assert batch.queues == ((near2.number,), (near1.number,))
+    assert batch.queues == ((floor.task(near2),), (floor.task(near1),))
     problem = batch.problem
     assert problem.ready == [50.0, 49.0]
     # Rows: ends of the robots' tasks in cells 50 and 150, ends of the tasks in 140 and 60.
@@ -159,9 +159,39 @@ def ends_the_present_task(floor: Floor, _near1: Task, _near2: Task) -> None:
     floor.book.cancel(present.id, floor.now)
 
 
-@pytest.mark.parametrize("happens", [ends_a_task, adds_a_task, loses_a_robot, ends_the_present_task])
+def changes_a_task(floor: Floor, near1: Task, _near2: Task) -> None:
+    floor.book.change(near1.id, replace(floor.task(near1).order, stops=(Stop(Action.GO, (190,)),)), floor.now)
+
+
+def keeps_a_task(floor: Floor, near1: Task, _near2: Task) -> None:
+    floor.book.change(near1.id, replace(floor.task(near1).order, robot="Robot2"), floor.now)
+
+
+def pauses_a_robot(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.facts.robots["Robot1"].mode = "paused"
+
+
+def shuts_a_cell(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.facts.shut, floor.facts.map_revision = frozenset({55}), 1
+
+
+def makes_time_pass(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.now += 100.0
+
+
+def gives_a_task_up(floor: Floor, near1: Task, _near2: Task) -> None:
+    floor.dispatcher.avoid(near1, "Robot1", floor.now)
+
+
+@pytest.mark.parametrize(
+    "happens",
+    [
+        *(ends_a_task, adds_a_task, loses_a_robot, ends_the_present_task, changes_a_task, keeps_a_task),
+        *(pauses_a_robot, shuts_a_cell, makes_time_pass, gives_a_task_up),
+    ],
+)
 def test_better_queues_come_too_late(happens: Callable[[Floor, Task, Task], None]) -> None:
-    """Nothing moves between robots that have other tasks by now."""
+    """All moves are made, or none if something has changed."""
     floor, near1, near2 = crossed()
     batch = batch_of(floor)
     routes = improve(batch.problem, 0.1)
@@ -169,16 +199,53 @@ def test_better_queues_come_too_late(happens: Callable[[Floor, Task, Task], None
     happens(floor, near1, near2)
     floor.dispatcher.adopt(batch, routes)
     floor.run(1)
-    moved = [event for event in floor.events if "instead of" in event.text]
+    moved = [event for event in floor.events if "moved from" in event.text]
     assert moved == []
 
 
-def test_a_charging_stop_leaves_its_robot_out() -> None:
-    """Where it ends is not known before a charger is chosen."""
+@pytest.mark.parametrize(
+    "stop",
+    [
+        Stop(Action.CHARGE),
+        Stop(Action.CHARGE, (20,)),
+        Stop(Action.GO, (20, 30)),
+        Stop(Action.GO, (20,), confirm=True),
+    ],
+    ids=["any charger", "charger", "cells", "confirm"],
+)
+@pytest.mark.parametrize("is_present", [True, False])
+def test_a_task_with_an_unknown_end_leaves_its_robot_out(stop: Stop, *, is_present: bool) -> None:
     floor, _, _ = crossed()
-    charge = floor.book.create(Order((Stop(Action.CHARGE),)), floor.now)
-    floor.book.advance(charge, TaskCause.ASSIGN, floor.now, "by hand", robot="Robot1")
+    task = floor.book.create(Order((stop,)), floor.now)
+    if is_present:
+        present = floor.book.task_of("Robot1")
+        assert present is not None
+        floor.book.cancel(present.id, floor.now)
+        floor.book.advance(task, TaskCause.START, floor.now, "by hand", robot="Robot1")
+    else:
+        floor.book.advance(task, TaskCause.ASSIGN, floor.now, "by hand", robot="Robot1")
     assert floor.dispatcher.batch(floor.now, floor.facts) is None
+
+
+def test_a_robot_that_must_charge_soon_gets_no_tasks_of_others() -> None:
+    floor, near1, near2 = crossed()
+    floor.facts.robots["Robot1"].battery = 0.3
+    floor.facts.robots["Robot2"].battery = 0.6
+    assert batch_of(floor).problem.able == [[1], [1]]
+    improved(floor)
+    assert robots_of(floor, near1, near2) == ["Robot2", "Robot2"]
+
+
+def test_a_task_that_takes_too_long_leaves_its_robot_out_only() -> None:
+    floor, near1, near2 = crossed()
+    floor.add("Robot3", 100)
+    floor.go(101, robot="Robot3")
+    floor.run(1)
+    endless = floor.deliver(102, 103, seconds=604_800.0)
+    floor.book.advance(endless, TaskCause.ASSIGN, floor.now, "by hand", robot="Robot3")
+    assert sorted(batch_of(floor).robots) == ["Robot1", "Robot2"]
+    improved(floor)
+    assert robots_of(floor, near1, near2, endless) == ["Robot1", "Robot2", "Robot3"]
 
 
 def test_few_robots_and_few_profiles_are_in_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +270,7 @@ def test_few_robots_and_few_profiles_are_in_a_batch(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("robots", [0, 1, 2])
-def test_without_queued_tasks_of_several_robots_nothing_is_looked_for(robots: int) -> None:
+def test_fewer_than_two_robots_with_tasks_make_no_batch(robots: int) -> None:
     floor = Floor(GridMap(1, 200), rules=TaskRules(profile=SPEED))
     for number in range(robots):
         floor.add(f"Robot{number}", 20 * number)

@@ -47,7 +47,7 @@ def cost(problem: RoutingProblem, routes: Sequence[Sequence[int]]) -> float:
             total += problem.weights[task] * time + problem.late * max(
                 0.0, time - max(0.0, problem.deadlines[task])
             )
-            total += problem.keep * (owner[task] != robot)
+            total += problem.keep * problem.weights[task] * (owner[task] != robot)
     return total
 
 
@@ -59,6 +59,12 @@ def test_what_saves_less_than_it_must_stays() -> None:
     """80 s are saved for each of the tasks."""
     assert improve(replace(CROSSED, keep=79.0), 0.1) == [[1], [0]]
     assert improve(replace(CROSSED, keep=81.0), 0.1) is None
+
+
+@pytest.mark.parametrize(("keep", "moves"), [(79.0, True), (81.0, False)])
+def test_what_must_be_saved_counts_with_the_weight(keep: float, moves: bool) -> None:
+    important = replace(CROSSED, weights=[10, 10], keep=keep)
+    assert improve(important, 0.1) == ([[1], [0]] if moves else None)
 
 
 def test_a_robot_that_is_ready_late_gets_less() -> None:
