@@ -15,6 +15,7 @@ from rce.ros.types import TypeRegistry
 from rce_fleet.drivers.program import run_world
 from rce_fleet.drivers.robot_driver import RobotDriver
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.simulation.battery import Battery, BatterySpec
 from rce_fleet.simulation.world import World
 from support.resting_robot import PACKAGES, fleet_program
 
@@ -45,10 +46,17 @@ class ManagedFleet:
         starts: Cells of the robots.
         grid: The floor.
         pace: How much faster than real time the robots are.
+        parameters: Parameters of the manager, as words of its command line.
     """
 
     def __init__(
-        self, core: Core, journal: Path, starts: list[int], grid: GridMap | None = None, pace: float = 4.0
+        self,
+        core: Core,
+        journal: Path,
+        starts: list[int],
+        grid: GridMap | None = None,
+        pace: float = 4.0,
+        parameters: tuple[str, ...] = (),
     ) -> None:
         self.core = core
         self.grid = grid or GridMap()
@@ -56,6 +64,7 @@ class ManagedFleet:
         self.events: list[dict[str, Any]] = []
         self._journal = journal
         self._pace = pace
+        self._parameters = parameters
         self._programs: dict[str, tuple[AsyncExitStack, asyncio.subprocess.Process]] = {}
         self._node: Node
         for number, cell in enumerate(starts, 1):
@@ -91,7 +100,7 @@ class ManagedFleet:
     async def start(self, exe: str) -> None:
         """Start planner or manager."""
         stack = AsyncExitStack()
-        options = [f"_journal:={self._journal}"] if exe == "fleet_manager.py" else []
+        options = [f"_journal:={self._journal}", *self._parameters] if exe == "fleet_manager.py" else []
         walls = sorted(self.grid.blocked)
         if exe == "fleet_planner.py":
             options = [f"_walls:={walls}", f"_rows:={self.grid.rows}", f"_columns:={self.grid.columns}"]
@@ -143,6 +152,15 @@ class ManagedFleet:
             return await self._node.service_client(service, service_type).call(fields, timeout=30)
         except RosError:
             return None
+
+    async def set_battery(self, robot: str, share: float) -> None:
+        """Set a robot's battery; wait until the manager knows it, and that the robot is idle."""
+        self.world.robots[robot].battery = Battery(BatterySpec(capacity=60.0, charge=share))
+        shown: dict[str, Any] = {}
+        async with asyncio.timeout(LONGEST_S):
+            while shown.get("state") != "idle" or abs((shown["battery"] or 0.0) - share) > 0.01:
+                await asyncio.sleep(0.2)
+                shown = (await self.ask("GET", f"/robots/{robot}")).body
 
     async def until_state(self, task: str, *states: str) -> dict[str, Any]:
         """Wait until a task is in one of some states; return it."""

@@ -39,3 +39,14 @@ async def test_tasks_are_carried_out_by_robots(tmp_path: Path) -> None:
         assert {event["name"] for event in fleet.events} >= {"created", "started", "arrived", "finished"}
         figures = (await fleet.ask("GET", "/statistics?seconds=600")).body
         assert figures["tasks_done"] == 3
+
+
+async def test_a_robot_with_little_energy_is_dearer(tmp_path: Path) -> None:
+    """Robot1 is 3 m nearer to the task, and the weight of energy is large."""
+    weights = ("_energy_weight:=100000.0", "_fairness_weight:=0.0")
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7], parameters=weights) as fleet:
+        await fleet.set_battery("Robot1", 0.3)
+        await fleet.set_battery("Robot2", 0.9)
+        task = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": 2}]})).body["id"]
+        done = await fleet.until_state(task, "done")
+        assert [visit["robot"] for visit in done["visits"]] == ["Robot2"]
