@@ -103,3 +103,31 @@ async def test_a_task_goes_to_the_robot_that_need_not_drive_around_a_one_way_zon
         created = await fleet.ask("POST", "/tasks", {"stops": [{"cell": 4}]})
         task = await fleet.until_state(created.body["id"], "done")
         assert task["robot_assigned"] == "Robot1"
+
+
+async def test_a_one_way_zone_for_one_robot_lets_others_pass(tmp_path: Path) -> None:
+    """Robot1 drives around a zone that is for it, and through one that is for Robot2, against both."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [4, 63]) as fleet:
+        body = fleet.world.robots["Robot1"]
+
+        async def rows_on_the_way(cell: int) -> set[int]:
+            """Send Robot1 to a cell; return the rows in which it was."""
+            task = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": cell}], "robot": "Robot1"})).body
+            arriving = asyncio.create_task(fleet.until_state(task["id"], "done"))
+            rows = set()
+            while not arriving.done():
+                at = fleet.grid.cell_at(body.pose.x, body.pose.y)
+                assert at is not None
+                rows.add(at // fleet.grid.columns)
+                await asyncio.sleep(0.02)
+            await arriving
+            return rows
+
+        for robot, rows in (("Robot1", {0, 1}), ("Robot2", {0})):
+            zone = {"kind": "one_way", "cells": [1, 2, 3, 4, 5, 6], "value": 0.0, "robots": [robot]}
+            async with asyncio.timeout(LONGEST_S):
+                while (await fleet.ask("PUT", "/zones/aisle", zone)).status not in (200, 201):
+                    await asyncio.sleep(0.2)
+            assert await rows_on_the_way(1) == rows
+            assert await rows_on_the_way(4) == {0}
+        assert fleet.world.collisions.total == 0
