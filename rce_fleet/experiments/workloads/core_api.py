@@ -11,6 +11,8 @@ from http.client import HTTPConnection
 from typing import Any
 
 TIMEOUT_S = 3.0
+END_S = 30.0
+"""How long a node may take to answer that it ends, on a busy machine too."""
 
 
 class CoreApi:
@@ -55,16 +57,19 @@ class CoreApi:
 
         Raises:
             OSError, xmlrpc.client.Error: The core does not answer.
+            TimeoutError: The node neither answers nor refuses: the run says nothing, and must be done again.
         """
         uri = self._call(self._uri, "lookupNode", name)
         try:
-            self._call(uri, "shutdown", "an experiment")
+            self._call(uri, "shutdown", "an experiment", timeout=END_S)
+        except TimeoutError:
+            raise
         except OSError:
             return False
         return True
 
-    def _call(self, uri: str, method: str, *arguments: Any) -> Any:
-        with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as core:
+    def _call(self, uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> Any:
+        with xmlrpc.client.ServerProxy(uri, transport=_Transport(timeout)) as core:
             code, text, value = getattr(core, method)(self._caller, *arguments)
         if code != 1:
             raise OSError(f"{method}: {text}")
@@ -72,10 +77,14 @@ class CoreApi:
 
 
 class _Transport(xmlrpc.client.Transport):
-    """Gives up after a while."""
+    """Gives up after some seconds."""
+
+    def __init__(self, timeout: float) -> None:
+        super().__init__()
+        self._timeout = timeout
 
     def make_connection(self, host: Any) -> HTTPConnection:
         """Return a connection to a host."""
         connection: HTTPConnection = super().make_connection(host)
-        connection.timeout = TIMEOUT_S
+        connection.timeout = self._timeout
         return connection

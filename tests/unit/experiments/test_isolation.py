@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import pytest
 
 from rce_fleet.experiments.isolation import deeds, is_ended, reached, to_add
 from rce_fleet.experiments.systems.multi_master import MultiMaster
+from rce_fleet.experiments.workloads import core_api
 from rce_fleet.experiments.workloads import reach as module
 from rce_fleet.experiments.workloads.core_api import CoreApi
 from rce_fleet.experiments.workloads.reach import Reach
@@ -49,13 +51,17 @@ class Graph:
 
 
 @contextmanager
-def core() -> Iterator[tuple[str, list[str]]]:
-    """A core that is every node's slave API too; gives its URI, and who was told to end."""
+def core(slave: str = "") -> Iterator[tuple[str, list[str]]]:
+    """A core that is every node's slave API too; gives its URI, and who was told to end.
+
+    Args:
+        slave: URI of the slave API of all nodes, if it is another one.
+    """
     told: list[str] = []
 
     def look_up(_caller: str, name: str) -> str:
         told.append(name)
-        return uri
+        return slave or uri
 
     with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
         uri = f"http://127.0.0.1:{server.server_address[1]}/"
@@ -101,6 +107,21 @@ def test_a_program_looks_tries_and_ends_the_others_nodes(
         "can_use_core": 0,
     }
     assert end == {"phase": "end"}
+
+
+def test_a_refusing_node_is_not_told_and_a_silent_one_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A program that is slow on a busy machine must not count as one that cannot be ended."""
+    monkeypatch.setattr(core_api, "END_S", 0.2)
+    with core("http://127.0.0.1:1/") as (uri, _):
+        assert not CoreApi("/reach", uri).end_node("/Robot2_base_1")
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        core(f"http://127.0.0.1:{silent.getsockname()[1]}/") as (uri, _),
+        pytest.raises(TimeoutError),
+    ):
+        CoreApi("/reach", uri).end_node("/Robot2_base_1")
 
 
 def test_a_refusal_of_the_core_is_an_error() -> None:
