@@ -7,10 +7,10 @@ import contextlib
 import logging
 import time
 from collections import Counter
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import msgspec
+from msgspec.structs import replace
 from websockets.exceptions import ConnectionClosed
 
 from rce.aio.tasks import TaskScope
