@@ -28,6 +28,9 @@ from rce_fleet.tasks.routing_problem import RoutingProblem
 from rce_fleet.tasks.task import TaskCause
 
 LOG = logging.getLogger("manager")
+pytestmark = pytest.mark.skipif(
+    not batch_worker.is_available(), reason="OR-Tools is missing (pip install rce[routing])"
+)
 CROSSED = RoutingProblem(
     ready=[0.0, 0.0],
     profiles=[0, 0],

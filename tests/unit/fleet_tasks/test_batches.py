@@ -15,10 +15,12 @@ from rce_fleet.tasks.batches import Batch, Move
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.records import RobotEntry, RobotProfile
-from rce_fleet.tasks.routing import improve
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
 
 from .conftest import Floor
+
+REASON = "OR-Tools is missing (pip install rce[routing])"
+improve = pytest.importorskip("rce_fleet.tasks.routing", reason=REASON).improve
 
 SPEED = RobotProfile(speed=1.0)
 

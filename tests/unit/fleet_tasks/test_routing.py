@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rce_fleet.tasks.routing import improve
 from rce_fleet.tasks.routing_problem import RoutingProblem
+
+REASON = "OR-Tools is missing (pip install rce[routing])"
+improve = pytest.importorskip("rce_fleet.tasks.routing", reason=REASON).improve
 
 
 def on_a_line(robots: Sequence[float], tasks: Sequence[float], queues: list[list[int]]) -> RoutingProblem:
