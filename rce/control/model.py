@@ -48,6 +48,10 @@ class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Where to dial beside it: the copy of a peer that is being moved (:mod:`rce.link.takeover`)."""
     copy: bool = False
     """Whether this end belongs to such a copy: it is silent until this is no longer set."""
+    epoch: int = 0
+    """How often this end's endpoint was placed; the dialing end says it."""
+    peer_epoch: int = 0
+    """The same of the peer: the accepting end takes no link of a place that the peer has left."""
 
 
 class ConnectionSpec(Struct, frozen=True, kw_only=True):

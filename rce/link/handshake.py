@@ -22,6 +22,8 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     copy: bool = False
     """Whether the dialing end is a copy: the connection is to stand beside the accepting end's present one,
     also if that one is down."""
+    epoch: int | None = None
+    """How often the dialing end's endpoint was placed; not said by the versions before."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,9 +43,19 @@ _hello_decoder = msgspec.json.Decoder(Hello)
 _welcome_decoder = msgspec.json.Decoder(Welcome)
 
 
-def encode_hello(link: str, token: str, *, standby: bool = False, copy: bool = False) -> bytes:
+def encode_hello(
+    link: str, token: str, *, standby: bool = False, copy: bool = False, epoch: int | None = None
+) -> bytes:
     """Write the first frame of a link's dialing end."""
-    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES, standby=standby, copy=copy)
+    hello = Hello(
+        version=VERSION,
+        link=link,
+        token=token,
+        features=FEATURES,
+        standby=standby,
+        copy=copy,
+        epoch=epoch,
+    )
     return encode(Frame(FrameType.HELLO, payload=msgspec.json.encode(hello)))
 
 

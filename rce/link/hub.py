@@ -227,7 +227,7 @@ class LinkHub:
         """
         local = self._accepting.get(spec.id)
         if local is not None:
-            _check_token(local, spec.token)
+            _check(local, spec.token, spec.epoch)
             ours, theirs = LocalCarrier.pair()
             local.accept(theirs, standby=standby, copy=spec.copy)
             return ours
@@ -277,7 +277,8 @@ class LinkHub:
     async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec, *, standby: bool) -> Carrier:
         """Shake hands as the dialing end."""
         try:
-            carrier.greet(encode_hello(spec.id, spec.token, standby=standby, copy=spec.copy))
+            hello = encode_hello(spec.id, spec.token, standby=standby, copy=spec.copy, epoch=spec.epoch)
+            carrier.greet(hello)
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
@@ -350,7 +351,7 @@ class LinkHub:
     async def _find(self, hello: Hello) -> Link:
         """Return the link that a peer asks for."""
         link = await self._wait_for(hello.link)
-        _check_token(link, hello.token)
+        _check(link, hello.token, hello.epoch)
         return link
 
     async def _wait_for(self, link_id: str) -> Link:
@@ -363,6 +364,9 @@ class LinkHub:
         return link
 
 
-def _check_token(link: Link, token: str) -> None:
+def _check(link: Link, token: str, epoch: int | None) -> None:
+    """Refuse what is not the peer, and a place that the peer has left, which may not know it yet."""
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
         raise LinkRefusedError(f"wrong token for link {link.spec.id!r}")
+    if epoch is not None and epoch < link.spec.peer_epoch:
+        raise LinkRefusedError(f"link {link.spec.id!r}: {link.spec.peer} is somewhere else now")

@@ -368,12 +368,10 @@ _PHASES = {EndpointState.RUNNING: ContainerEvent.RUNNING, EndpointState.DEGRADED
 
 
 def _settle(tx: Transaction, container: Container, move: Move) -> None:
-    tx.put(replace(container, task_set=move.to))
     if move.status is not None:
-        tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
+        container = replace(container, address=move.status.address)
+    endpoints.assign(tx, container, move.to)
     placing.happened(tx, move.id, ContainerEvent.PLACE)
-    tx.touch(move.id)
-    endpoints.touch_dialers(tx, move.id)
 
 
 def promote(tx: Transaction, container: Container) -> bool:

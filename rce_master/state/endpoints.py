@@ -86,6 +86,19 @@ def remove_connection(tx: Transaction, connection: Connection) -> None:
             tx.touch_link(endpoint, connection.link)
 
 
+def assign(tx: Transaction, endpoint: Endpoint, process: str) -> None:
+    """Make a task set responsible for an endpoint; it was not before.
+
+    Peers take no links from its former place any more, which may not know that it was left: a machine that
+    hung or was cut off continues to dial when it comes back.
+    """
+    tx.put(msgspec.structs.replace(endpoint, task_set=process, epoch=endpoint.epoch + 1))
+    tx.touch(endpoint.id)
+    for link in tx.tables.links.by("endpoint", endpoint.id):
+        for end in (link.a, link.b):
+            tx.touch_link(end, link.id)
+
+
 def withdraw(tx: Transaction, endpoint: Endpoint, reason: str, *, elsewhere: bool = False) -> None:
     """Have the endpoint's present task set drop it.
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce_master.exceptions import NoRoomError
-from rce_master.state import capacity, volumes
+from rce_master.state import capacity, endpoints, volumes
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, ContainerLive
@@ -132,10 +132,9 @@ def best(tx: Transaction, container: Container, among: Collection[str] | None = 
 
 def bind(tx: Transaction, container: Container, process: str) -> None:
     """Make a task set responsible for a container."""
-    tx.put(replace(container, task_set=process))
+    endpoints.assign(tx, container, process)
     volumes.bind(tx, container, process)
     happened(tx, container.id, ContainerEvent.PLACE)
-    tx.touch(container.id)
     tx.happen("container_placed", container.id, f"at {process}")
 
 

@@ -32,6 +32,8 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
     revision: int = 0
     task_set: str = ""
     """Process name of the task set that is responsible; empty: none."""
+    epoch: int = 0
+    """Grows with each task set that becomes responsible: what still comes from former ones has less."""
     size: int = 0
     """Bytes of its contents, as :func:`rce_master.state.endpoints.size_of` counts them."""
 

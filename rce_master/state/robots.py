@@ -88,10 +88,8 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
     if robot.task_set != process:
         if robot.task_set:
             endpoints.withdraw(tx, robot, "the robot connected elsewhere")
-        robot = replace(robot, task_set=process)
-        tx.touch(id_)
-        endpoints.touch_dialers(tx, id_)
-    tx.put(replace(robot, credential=command.credential))
+        endpoints.assign(tx, robot, process)
+    tx.put(replace(tx.tables.endpoints[id_], credential=command.credential))
     tx.put(replace(live.after(RobotEvent.LOGIN, tx.now), status=None))
     activity.forget(tx, id_)
 

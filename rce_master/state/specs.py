@@ -36,7 +36,7 @@ def _copy_end(tables: Tables, link: LinkSpec) -> LinkSpec:
     """Return a copy's end of a link; the copies of two containers that move together are linked."""
     peer = _copy_address(tables, link.peer)
     address = peer if link.dial and peer is not None else link.address
-    return replace(link, copy=True, address=address, next=None)
+    return replace(link, copy=True, address=address, next=None, epoch=link.epoch + 1)
 
 
 def _copy_address(tables: Tables, id_: str) -> LinkAddress | None:
@@ -140,6 +140,8 @@ def link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
         dial=dial,
         address=endpoints.address(tables, peer) if dial else LinkAddress(),
         next=_copy_address(tables, peer) if dial and not moves_too else None,
+        epoch=tables.endpoints[id_].epoch,
+        peer_epoch=tables.endpoints[peer].epoch,
     )
 
 

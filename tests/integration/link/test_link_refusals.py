@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 from support.link_frames import answer, hello, read_on
 from support.link_kinds import TOPIC_OUT
 
@@ -47,6 +49,35 @@ async def test_endpoint_with_a_wrong_token_does_not_connect(rig: Rig, way: str) 
     with pytest.raises(LinkRefusedError):
         await a.hub.connect(a.spec.links[0])
     assert a.endpoint.connections == ()
+
+
+async def test_former_place_does_not_get_its_link_back(rig: Rig, way: str) -> None:
+    """A machine that hung dials when it wakes, before it hears that its endpoint was placed elsewhere."""
+    former, b = await rig.pair(way)
+    await rig.join(former, b, [TOPIC_OUT])
+    await former.connected(1)
+    present = rig.party("a", former.hub if way == "local" else await rig.hub())
+    (link,) = former.spec.links
+    await present.apply({"i1": TOPIC_OUT[0]}, [replace(link, epoch=2)], list(former.spec.connections))
+    await present.connected(1)
+    await b.apply(links=[replace(b.spec.links[0], peer_epoch=2)])
+    with pytest.raises(LinkRefusedError):
+        await former.hub.connect(replace(link, epoch=1))
+    await former.connected()
+    assert present.endpoint.connections == b.endpoint.connections == (1,)
+    assert present.fakes["i1"].active == [True]
+
+
+async def test_place_of_a_release_before_is_taken(rig: Rig) -> None:
+    """It says no epoch."""
+    _, b = await rig.pair("unix")
+    await b.apply(links=[LinkSpec(id="L", peer="user/a", token="secret", dial=False, peer_epoch=2)])
+    for epoch, is_taken in ((None, True), (1, False), (2, True), (3, True)):
+        reader, writer = await hello(b.address, encode_hello("L", "secret", epoch=epoch))
+        with contextlib.nullcontext() if is_taken else pytest.raises(LinkRefusedError):
+            check_answer(await answer(reader))
+        writer.close()
+        await writer.wait_closed()
 
 
 @pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])

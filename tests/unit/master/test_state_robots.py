@@ -73,6 +73,22 @@ def test_a_robot_moves_to_another_task_set(world: World) -> None:
     assert (link.dial, link.address.port) == (True, 2)
 
 
+def test_peers_learn_that_a_robot_left_a_task_set(world: World) -> None:
+    """The task set may hang or be cut off, and dial again before it hears of it."""
+    world.wired()
+    (former,) = world.spec("rob").links
+    assert world.spec("c").links[0].peer_epoch == former.epoch
+    world.robot_set("r2", port=2)
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    changes = world.login(process="r2")
+    (present,) = world.spec("rob").links
+    assert present.epoch > former.epoch
+    assert world.spec("c").links[0].peer_epoch == present.epoch
+    assert list(changes.touched["anna/c"].links) == [present.id]
+    changes = world.login("other", process="r2")
+    assert "anna/c" not in changes.touched
+
+
 def test_robots_of_a_killed_task_set_come_back_at_another(world: World) -> None:
     world.wired()
     before = world.spec("rob")
