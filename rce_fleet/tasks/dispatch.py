@@ -217,9 +217,12 @@ class Dispatcher:
         queues = self._queues.improvable(now, chosen)
         tasks = {queue.robot: self._book.task_of(queue.robot) for queue in queues}
         present = {robot: task.number for robot, task in tasks.items() if task is not None}
+        return self._batches.make(queues, present, now, self._progress.avoid.keys(), self._weak(chosen))
+
+    def _weak(self, robots: Iterable[RobotFacts]) -> set[str]:
+        """Return the robots whose batteries are too low for tasks of others."""
         least = self.rules.battery.sufficient
-        weak = {robot.id for robot in chosen if robot.battery is not None and robot.battery < least}
-        return self._batches.make(queues, present, now, self._progress.avoid.keys(), weak)
+        return {robot.id for robot in robots if robot.battery is not None and robot.battery < least}
 
     def adopt(self, batch: Batch, routes: list[list[int]]) -> None:
         """Take better queues over in the next step, unless something has changed by then.
@@ -422,7 +425,8 @@ class Dispatcher:
                     self._book.advance(task, TaskCause.RELEASE, now, reason, robot="")
         if self._found is not None:
             batch, routes = self._found
-            self._queues.adopt(batch, routes, now, facts.robots, self._progress.avoid.keys())
+            weak = self._weak(facts.robots.values())
+            self._queues.adopt(batch, routes, now, facts.robots, self._progress.avoid.keys(), weak)
             self._found = None
         self._conditions.refresh()  # Another robot may take what was released.
         if busy := self._queues.busy(now, facts.robots.values()):

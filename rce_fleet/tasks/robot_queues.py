@@ -139,6 +139,7 @@ class RobotQueues:
         now: float,
         robots: Mapping[str, RobotFacts],
         avoided: Collection[tuple[int, str]],
+        weak: Collection[str],
     ) -> None:
         """Give tasks to the queues of other robots: all of them, or none if something has changed since.
 
@@ -148,6 +149,7 @@ class RobotQueues:
             now: Seconds since 1970.
             robots: What is known of the robots, by name.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
+            weak: Robots that get no tasks of others, because their batteries are low.
         """
         if now - batch.made_at > LATEST_S or self._travel.version != batch.map_version:
             return
@@ -160,7 +162,9 @@ class RobotQueues:
                 return
         tasks = [self._book.tasks[move.task] for move in moves]
         for task, move in zip(tasks, moves, strict=True):
-            if misfit(task, move.target, self._profile(move.target)) or (task.number, move.target) in avoided:
+            if move.target in weak or (task.number, move.target) in avoided:
+                return
+            if misfit(task, move.target, self._profile(move.target)):
                 return
         for task, move in zip(tasks, moves, strict=True):
             text = f"moved from {move.source} to {move.target}: the queued tasks together are done earlier"

@@ -185,11 +185,15 @@ def gives_a_task_up(floor: Floor, near1: Task, _near2: Task) -> None:
     floor.dispatcher.avoid(near1, "Robot1", floor.now)
 
 
+def drains_a_battery(floor: Floor, _near1: Task, _near2: Task) -> None:
+    floor.facts.robots["Robot1"].battery = 0.3
+
+
 @pytest.mark.parametrize(
     "happens",
     [
         *(ends_a_task, adds_a_task, loses_a_robot, ends_the_present_task, changes_a_task, keeps_a_task),
-        *(pauses_a_robot, shuts_a_cell, makes_time_pass, gives_a_task_up),
+        *(pauses_a_robot, shuts_a_cell, makes_time_pass, gives_a_task_up, drains_a_battery),
     ],
 )
 def test_better_queues_come_too_late(happens: Callable[[Floor, Task, Task], None]) -> None:
