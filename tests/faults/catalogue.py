@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from faults.scenarios import disk, etcd, kill, network
+from faults.scenarios import backup, disk, etcd, kill, network
 from faults.world import World
 
 
@@ -27,6 +27,7 @@ class Scenario:
 SCENARIOS = (
     Scenario("kill", kill.kill, short=True),
     Scenario("stop", kill.stop, short=True),
+    Scenario("stop-idle", kill.stop_idle),
     Scenario("terminate", kill.terminate, short=True),
     Scenario("cut", network.cut),
     Scenario("cut-from-task-sets", network.cut_from_task_sets),
@@ -44,4 +45,5 @@ SCENARIOS = (
     Scenario("full-database", etcd.full_database, robot=False, short=True),
     Scenario("replace-member", etcd.replace_member, robot=False),
     Scenario("upgrade", kill.upgrade),
+    Scenario("restore", backup.restore),
 )

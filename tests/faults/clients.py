@@ -54,6 +54,9 @@ class Clients:
         self._numbers = itertools.count(1)
         self._tasks: list[asyncio.Task[None]] = []
         self._answers: deque[str] = deque(maxlen=LAST_ANSWERS)
+        self._may_ask = asyncio.Event()
+        self._may_ask.set()
+        self._asking = 0
 
     async def prepare(self) -> None:
         """Log in, and make the users whose limits are the registers."""
@@ -100,6 +103,16 @@ class Clients:
         for result in results:
             if isinstance(result, Exception):
                 raise result
+
+    @asynccontextmanager
+    async def paused(self) -> AsyncIterator[None]:
+        """Let no client ask for anything; begin when each of them has its answer."""
+        self._may_ask.clear()
+        try:
+            await until(lambda: not self._asking, timeout=PATIENCE_S, what="all clients have their answers")
+            yield
+        finally:
+            self._may_ask.set()
 
     def check(self) -> None:
         """Check that the clients continue.
@@ -208,6 +221,8 @@ class Clients:
     async def _ask(
         self, session: aiohttp.ClientSession, method: str, url: str, body: object = None
     ) -> tuple[Fate, dict[str, Any]]:
+        await self._may_ask.wait()
+        self._asking += 1
         try:
             async with session.request(method, url, json=body) as reply:
                 if reply.status < 300:
@@ -221,4 +236,6 @@ class Clients:
                     return Fate.NOT_DONE, {}
         except _FAILURES as error:
             self._answers.append(f"{method} {url}: {error!r}")
+        finally:
+            self._asking -= 1
         return Fate.UNKNOWN, {}

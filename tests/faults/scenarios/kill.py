@@ -1,12 +1,16 @@
-"""Processes that end: kill -9, SIGTERM, SIGSTOP, and an upgrade."""
+"""Processes that end or hang: kill -9, SIGTERM, SIGSTOP, and an upgrade."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
-from faults.machines import send
+from support.engine import until
+
+from faults.machines import PATIENCE_S, Machine, send
 from faults.world import World
 
 ROUNDS = 2
@@ -56,21 +60,44 @@ async def _kill_standby(world: World) -> float:
 
 
 async def stop(world: World) -> None:
-    """Stop the leading master so long that its lease ends, and let it go on: under load, and without."""
+    """Stop the leading master so long that its lease ends, and let it go on, while clients write and read."""
+    async with _stopped(world) as (_, since):
+        end = await world.until_written("stop of the leading master", since)
+        await world.until_task_sets_are_back(end)
+    await world.whole()
+
+
+async def stop_idle(world: World) -> None:
+    """Do so while no client asks for anything: the master that wakes has no request that would tell it."""
+    async with world.clients.paused(), _stopped(world) as (leader, _):
+        await world.cluster.leader(but=leader)
+        await world.until_task_sets_are_back(time.monotonic())
+    await world.whole()
+
+
+@asynccontextmanager
+async def _stopped(world: World) -> AsyncIterator[tuple[Machine, float]]:
+    """Stop the leading master meanwhile, for a minimum of time; when it goes on, it must notice.
+
+    Yields:
+        The machine of the master, and when it was stopped.
+    """
     seconds = STOP_S if world.scale == 1 else LONG_STOP_S
     leader = await world.cluster.leader()
     said = len(leader.master.output())
     since = time.monotonic()
     send(leader.master, signal.SIGSTOP)
     try:
-        end = await world.until_written("stop of the leading master", since)
-        await world.until_task_sets_are_back(end)
+        yield leader, since
         await world.cluster.leader(but=leader)
         await asyncio.sleep(max(0.0, since + seconds - time.monotonic()))
     finally:
         send(leader.master, signal.SIGCONT)
-    await world.whole()
-    assert "leads no more" in leader.master.output()[said:]
+
+    def noticed() -> bool:
+        return "leads no more" in leader.master.output()[said:]
+
+    await until(noticed, timeout=PATIENCE_S, what="the master that was stopped says that it leads no more")
 
 
 async def terminate(world: World) -> None:
