@@ -27,9 +27,9 @@ REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_TIMEOUT_S = 3.0
 RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
 """Environment variable for :mod:`support.roscpp_programs`: the folder of what all workers of a run share."""
-WORKERS_PER_CORE = 2
-REAL_TIME_WORKERS = 2
-"""How many of the workers have the tests that are in real time."""
+WORKERS_PER_CORE = 2.5
+WORKERS_PER_THREAD = 2
+"""Of a core with several threads, which share its time."""
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
 hypothesis.settings.register_profile(
@@ -261,16 +261,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def _group(items: list[pytest.Item]) -> None:
     """Keep tests together, in one worker, that share what is made once or is the machine's.
 
-    What podman keeps is the machine's; what a person finds out about the sandbox takes long. Modules whose
-    tests are in real time have few workers: what runs late drives on for longer, and makes others late.
+    What podman keeps is the machine's; what a person finds out about the sandbox takes long. Tests in real
+    time have one worker: robots of two that run late together drive for longer, and may not arrive in time.
     """
-    real_time: dict[Path, int] = {}
     for item in items:
         if item.get_closest_marker("xdist_group"):
             continue
         if item.get_closest_marker("real_time"):
-            lane = real_time.setdefault(item.path, len(real_time)) % REAL_TIME_WORKERS
-            item.add_marker(pytest.mark.xdist_group(f"real time {lane}"))
+            item.add_marker(pytest.mark.xdist_group("real time"))
             continue
         callspec = getattr(item, "callspec", None)
         person = callspec and callspec.params.get("person")
@@ -313,7 +311,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def pytest_xdist_auto_num_workers() -> int:
     """Return how many tests run at once: most wait for processes and the clock much of their time."""
-    return WORKERS_PER_CORE * len(os.sched_getaffinity(0))
+    cores = psutil.cpu_count(logical=False)
+    has_threads = cores is not None and cores < (psutil.cpu_count() or cores)
+    return int((WORKERS_PER_THREAD if has_threads else WORKERS_PER_CORE) * len(os.sched_getaffinity(0)))
 
 
 def _is_worker(config: pytest.Config) -> bool:

@@ -20,7 +20,7 @@ async def test_light_robots_do_tasks_while_the_planner_dies(tmp_path: Path) -> N
     code, report, text = await run_headless(
         *("--world", world, "--robots", 4, "--full-stack", 0, "--robots-per-container", 2),
         *("--duration", 24),
-        timeout=240,
+        timeout=400,
     )
     assert code == 0, text
     assert report["ok"] is True
