@@ -26,9 +26,10 @@ from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
 from rce_fleet.demo.resources import ANY, MAX_PORT, Ports, run_folder
-from rce_fleet.demo.scenario import MANY, choose_scenario
-from rce_fleet.demo.worlds import NamedWorld, find_world
+from rce_fleet.demo.scenario import MANY, choose_scenario, find_lanes, lane_scenario
+from rce_fleet.demo.worlds import NamedWorld, find_world, on_lanes
 from rce_fleet.exceptions import FleetError
+from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.station.client import StationClient
 
@@ -94,6 +95,10 @@ def demo(
     scen: Annotated[
         Path | None,
         typer.Option(help="Starts and goals on the map (MovingAI .scen).", exists=True, dir_okay=False),
+    ] = None,
+    lanes: Annotated[
+        Path | None,
+        typer.Option(help="Let robots drive on the lanes of this file only (YAML or JSON).", dir_okay=False),
     ] = None,
     replicas: Annotated[
         int,
@@ -162,7 +167,8 @@ def demo(
             raise DemoError("--slam maps on the robot: use it without --offload")
         _check_replicas(replicas, mode)
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
-        fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen)
+        ways = find_lanes(lanes, find_world(world).grid, slam=slam, blocked_cells=blocked_cells)
+        fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen, ways)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
         _check_duration(duration, timeout, mode, headless=headless)
         if report is not None and headless:
@@ -182,7 +188,7 @@ def demo(
                 core=core,
                 core_uri=core_uri,
                 machines=machines,
-                blocked_cells=int(not fleet.has_light) if blocked_cells is None else blocked_cells,
+                blocked_cells=_count_blocked(blocked_cells, fleet, ways),
                 slam=slam,
                 full_stack=fleet.full_stack,
                 robots_per_container=robots_per_container,
@@ -190,6 +196,7 @@ def demo(
                 tasks=tasks,
                 world=fleet.world,
                 replicas=replicas,
+                lanes=ways,
             )
             show = typer.echo if verbose else _show_warning
             if headless:
@@ -214,8 +221,20 @@ class _Fleet(NamedTuple):
         return self.full_stack < len(self.scenario.robots)
 
 
+def _count_blocked(given: int | None, fleet: _Fleet, lanes: LaneGraph | None) -> int:
+    """Return how many cells a run blocks."""
+    if given is not None:
+        return given
+    return int(not fleet.has_light and lanes is None)
+
+
 def _choose_fleet(
-    count: int, full_stack: int | None, world: NamedWorld, seed: int, scen: Path | None
+    count: int,
+    full_stack: int | None,
+    world: NamedWorld,
+    seed: int,
+    scen: Path | None,
+    lanes: LaneGraph | None,
 ) -> _Fleet:
     """Choose scenario and kinds of robots; as the options say.
 
@@ -224,7 +243,11 @@ def _choose_fleet(
     """
     if full_stack is None:
         full_stack = count if count <= MANY else 0
-    scenario = choose_scenario(count, seed, grid=world.grid, scen=scen)
+    if lanes is None:
+        scenario = choose_scenario(count, seed, grid=world.grid, scen=scen)
+    else:
+        scenario = lane_scenario(count, seed, grid=world.grid, lanes=lanes, scen=scen)
+        world = on_lanes(world, lanes)
     if full_stack < count and scenario.hidden_boxes:
         # Light robots have no sensors: the planner is told of all boxes.
         scenario = replace(scenario, known_boxes=tuple(sorted(scenario.boxes)), hidden_boxes=())

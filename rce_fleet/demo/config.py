@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -13,6 +14,8 @@ from rce_fleet.demo.worlds import NamedWorld
 from rce_fleet.drivers.scene import scene_of
 from rce_fleet.maps.ros_map import save_map
 from rce_fleet.navigation.navigation import DriveLimits
+from rce_fleet.planning.lane_files import lane_text
+from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.wiring import FleetAccount
@@ -104,6 +107,7 @@ class DemoConfig:
         tasks: What is streamed.
         world: What the world has besides cells.
         replicas: How many masters the engine has.
+        lanes: What robots drive on; None: on all free cells.
     """
 
     scenario: Scenario
@@ -124,6 +128,7 @@ class DemoConfig:
     tasks: TaskSource = TaskSource.MANAGER
     world: NamedWorld | None = None
     replicas: int = 1
+    lanes: LaneGraph | None = None
 
     @property
     def full(self) -> int:
@@ -177,7 +182,16 @@ class DemoConfig:
         known = {name: value for name, value in cells.items() if value}
         motion = motion_on(grid.cell_size)
         turns = {"quarter_turn": round(motion.quarter_turn, 2), "stop": round(motion.stop, 2)}
-        return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **turns, **known}
+        lanes = {} if self.lanes is None else {"lanes": lane_text(self.lanes)}
+        given = {"seed": self.seed, "robot_radius": ROBOT_RADIUS}
+        return {**self.map_parameters, **given, **turns, **known, **lanes}
+
+    @property
+    def goal_cells(self) -> Sequence[int]:
+        """Cells to which robots may be sent; of lanes those from which they can go on."""
+        if self.lanes is None:
+            return self.scenario.grid.free
+        return sorted(self.lanes.connected_part())
 
     @property
     def chargers(self) -> tuple[int, ...]:

@@ -260,7 +260,7 @@ class _HeadlessRun:
         config, world = self._config, self._config.world
         cells: Sequence[int] = [] if world is None else [*world.docks, *world.shelves]
         rng = Random(config.seed)  # noqa: S311 - for tasks, not for secrets
-        cells, robots = cells or config.scenario.grid.free, len(config.scenario.robots)
+        cells, robots = cells or config.goal_cells, len(config.scenario.robots)
         stream: TaskStream = (
             ManagerTasks(demo.page, cells, rng, robots)
             if config.tasks is TaskSource.MANAGER

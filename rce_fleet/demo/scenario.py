@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
+from rce_fleet.demo.config import ROBOT_RADIUS
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.floor import FLOOR
 from rce_fleet.exceptions import FleetError
 from rce_fleet.planning.dijkstra import shortest_path
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lane_files import read_lanes
+from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.movingai import read_scenario
 from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario, spread_scenario
 
@@ -44,6 +48,66 @@ def choose_scenario(robots: int, seed: int, *, grid: GridMap = FLOOR, scen: Path
         if len(rows) < robots:
             raise DemoError(f"{scen} has {len(rows)} rows; {robots} robots need as many")
         return given_scenario(grid, [(row.start, row.goal) for row in rows], seed=seed)
+
+
+def find_lanes(
+    file: Path | None, grid: GridMap, *, slam: bool, blocked_cells: int | None
+) -> LaneGraph | None:
+    """Read the lanes of a demo.
+
+    Args:
+        file: YAML or JSON; None: there are no lanes.
+        grid: The cells.
+        slam: Whether there is no map at the start.
+        blocked_cells: How many cells are to be blocked, if that was given.
+
+    Returns:
+        Those that the demo's robots fit on.
+
+    Raises:
+        DemoError: They cannot be used.
+    """
+    if file is None:
+        return None
+    if slam:
+        raise DemoError("--lanes lie on a map: use it without --slam")
+    if blocked_cells:
+        raise DemoError("--blocked-cells cuts lanes, and with them goals: use it without --lanes")
+    with _name_source("--lanes"):
+        lanes, narrow = read_lanes(file, grid).fitting(2 * ROBOT_RADIUS)
+    if not lanes.lanes:
+        width = f"{2 * ROBOT_RADIUS:g} m"
+        raise DemoError(f"--lanes: {file}: all {len(narrow)} lanes are narrower than the robots, {width}")
+    return lanes
+
+
+def lane_scenario(
+    robots: int, seed: int, *, grid: GridMap, lanes: LaneGraph, scen: Path | None = None
+) -> Scenario:
+    """Return a scenario without boxes whose starts and goals are on lanes that lead from each to all others.
+
+    Args:
+        robots: Number of robots.
+        seed: The same seed draws the same scenario.
+        grid: The cells.
+        lanes: The lanes on them.
+        scen: Starts and goals, as for :func:`choose_scenario`.
+
+    Raises:
+        DemoError: A file cannot be read, the robots do not fit on the lanes, or a start or goal is on none.
+    """
+    part = lanes.connected_part()
+    if scen is not None:
+        found = choose_scenario(robots, seed, grid=grid, scen=scen)
+        for cell in (*found.starts, *found.goals):
+            if cell not in part:
+                raise DemoError(f"{scen}: from cell {cell} lanes do not lead to all others and back")
+        return found
+    with _name_source("--lanes"):
+        found = spread_scenario(
+            grid.with_blocked(cell for cell in range(len(grid)) if cell not in part), robots, seed=seed
+        )
+    return replace(found, grid=grid)
 
 
 @contextmanager

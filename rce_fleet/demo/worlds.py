@@ -26,6 +26,7 @@ from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.floor import FLOOR
 from rce_fleet.exceptions import FleetError, MapError
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.movingai import read_map
 
 _SHELF_COLUMNS, _SHELF_ROWS = 10, 2
@@ -54,6 +55,16 @@ class NamedWorld:
     docks: tuple[int, ...] = ()
     shelves: tuple[int, ...] = ()
     chargers: tuple[int, ...] = ()
+
+
+def on_lanes(world: NamedWorld, lanes: LaneGraph) -> NamedWorld:
+    """Return a world with those of its docks, shelves and chargers from which lanes lead to all others."""
+    part = lanes.connected_part()
+
+    def kept(cells: tuple[int, ...]) -> tuple[int, ...]:
+        return tuple(cell for cell in cells if cell in part)
+
+    return NamedWorld(world.grid, kept(world.docks), kept(world.shelves), kept(world.chargers))
 
 
 def warehouse() -> NamedWorld:

@@ -9,7 +9,7 @@ from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import LanesError, PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
 from rce_fleet.nodes.grid_parameters import GRID_PARAMETERS, read_count, read_number
-from rce_fleet.planning.lane_files import read_lanes
+from rce_fleet.planning.lane_files import parse_lanes, read_lane_text, read_lanes
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import planner_names
 
@@ -28,6 +28,8 @@ KNOWN = GRID_PARAMETERS | frozenset(
     }
 )
 """Names of all parameters."""
+_MARKS_OF_TEXT = "\n{"
+"""A text of lanes has one of them, and the path of a file hardly."""
 IMPROVE_SECONDS = 0.05
 """How long better paths are looked for. Nothing is granted meanwhile: less than a tick's time."""
 
@@ -71,6 +73,9 @@ def read_lane_graph(
 ) -> tuple[LaneGraph | None, list[str]]:
     """Return the lanes of the parameter ``lanes``, and a remark about each that is too narrow for the robots.
 
+    Its value is the path of a file, or what is in such a file: its text, or a mapping, as ``rosparam load``
+    makes one of it. So a container needs no file.
+
     Args:
         values: The parameters.
         grid: The grid that the lanes lie on.
@@ -82,13 +87,21 @@ def read_lane_graph(
     Raises:
         LanesError: The file cannot be read, its lanes cannot be driven on the grid, or all are too narrow.
     """
-    file = values.get("lanes")
-    if not file:
+    given = values.get("lanes")
+    if not given:
         return None, []
-    lanes, narrow = read_lanes(Path(str(file)), grid).fitting(2 * robot_radius)
+    source = "the parameter lanes"
+    if not isinstance(given, str):
+        found = parse_lanes(given, grid, source)
+    elif any(mark in given for mark in _MARKS_OF_TEXT):
+        found = read_lane_text(given, grid, source)
+    else:
+        source = given
+        found = read_lanes(Path(given), grid)
+    lanes, narrow = found.fitting(2 * robot_radius)
     remarks = [
-        f"{file}: lane {lane.name!r} is {lane.width:g} m wide, and robots with a radius of {robot_radius:g} m"
-        f" need {2 * robot_radius:g} m: it is not used"
+        f"{source}: lane {lane.name!r} is {lane.width:g} m wide, and robots with a radius of"
+        f" {robot_radius:g} m need {2 * robot_radius:g} m: it is not used"
         for lane in narrow
     ]
     if not lanes.lanes:

@@ -14,6 +14,7 @@ A path leads straight, along a row or a column of the grid, from each of its nod
 
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 from math import isfinite
 from typing import TYPE_CHECKING, Any
@@ -45,31 +46,64 @@ def read_lanes(path: Path, grid: GridMap) -> LaneGraph:
             and place.
     """
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise LanesError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise LanesError(f"{path}: not a text in UTF-8: {error}") from error
+    return read_lane_text(text, grid, str(path))
+
+
+def read_lane_text(text: str, grid: GridMap, source: str) -> LaneGraph:
+    """Read the text of a file of lanes.
+
+    Args:
+        text: The text.
+        grid: The grid that the lanes lie on.
+        source: Where it is from, for errors.
+
+    Raises:
+        LanesError: It is not YAML or JSON, or its lanes cannot be driven on the grid.
+    """
+    try:
+        found = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        raise LanesError(f"{path}{where}: not YAML or JSON: {getattr(error, 'problem', error)}") from error
-    try:
-        return parse_lanes(found, grid)
-    except LanesError as error:
-        raise LanesError(f"{path}: {error}") from error
+        raise LanesError(f"{source}{where}: not YAML or JSON: {getattr(error, 'problem', error)}") from error
+    return parse_lanes(found, grid, source)
 
 
-def parse_lanes(found: object, grid: GridMap) -> LaneGraph:
+def parse_lanes(found: object, grid: GridMap, source: str = "") -> LaneGraph:
     """Return the lane graph of a file's contents.
 
     Args:
         found: The contents, as YAML or JSON have them.
         grid: The grid that the lanes lie on.
+        source: Where they are from, for errors.
 
     Raises:
         LanesError: They are not those of lanes on this grid; the text names the place.
     """
+    try:
+        return _parse(found, grid)
+    except LanesError as error:
+        if not source:
+            raise
+        raise LanesError(f"{source}: {error}") from error
+
+
+def lane_text(lanes: LaneGraph) -> str:
+    """Return the text of a file with these lanes, as JSON."""
+    found = []
+    for lane in lanes.lanes:
+        entry: dict[str, object] = {"name": lane.name, "path": lane.cells, "one_way": lane.one_way}
+        limits = {"speed": lane.speed, "width": lane.width, "cost": lane.cost}
+        found.append(entry | {name: value for name, value in limits.items() if value})
+    return json.dumps({"lanes": found})
+
+
+def _parse(found: object, grid: GridMap) -> LaneGraph:
     content = _mapping(found, "the file", ("nodes", "lanes"))
     nodes = {
         str(name): _node(node, f"nodes.{name}", grid)

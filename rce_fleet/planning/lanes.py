@@ -164,6 +164,17 @@ class LaneGraph:
         found: NDArray[np.int32] = table[starts, directions]
         return found
 
+    def connected_part(self) -> frozenset[int]:
+        """Return the most cells from each of which lanes lead to all others: a robot there can go on."""
+        from scipy.sparse import csr_array  # long to load, needed only to choose starts and goals
+        from scipy.sparse.csgraph import connected_components
+
+        cells = np.array(sorted(self.cells))
+        starts, ends = np.searchsorted(cells, np.array(list(self.moves)).T)
+        graph = csr_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(len(cells), len(cells)))
+        _, labels = connected_components(graph, connection="strong")
+        return frozenset(map(int, cells[labels == np.bincount(labels).argmax()]))
+
     def speed_limit(self, cells: Sequence[int]) -> float:
         """Return the greatest speed on a way over some cells, metres per second; infinity without a limit."""
         lanes = (self.moves.get(move) for move in pairwise(cells))

@@ -72,6 +72,24 @@ async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path) -> None:
     assert all(robot["reached"] for robot in report["robots"])
 
 
+async def test_a_robot_keeps_to_its_lanes(tmp_path: Path) -> None:
+    """Its goal is the cell behind it, and it drives all around: the planner has the lanes in a container."""
+    world, scen, lanes = (tmp_path / name for name in ("ring.map", "ring.scen", "lanes.yaml"))
+    world.write_text("type octile\nheight 2\nwidth 6\nmap\n......\n......\n")
+    scen.write_text("version 1\n0\tring.map\t6\t2\t1\t0\t0\t0\t1\n")
+    lanes.write_text("lanes:\n  - {name: ring, path: [0, 5, 11, 6, 0], one_way: true, width: 0.9}\n")
+    code, report, text = await run_headless(
+        *(*LIGHT, "--world", world, "--scen", scen, "--robots", 1, "--lanes", lanes),
+        timeout=TIMEOUT_S,
+    )
+    assert code == 0, text
+    (robot,) = report["robots"]
+    assert robot["reached"]
+    assert (robot["start_cell"], robot["goal_cell"]) == (1, 0)
+    assert robot["distance_m"] > 10
+    assert report["blocked_cells"] == []
+
+
 async def test_run_that_times_out_reports_it() -> None:
     code, report, text = await run_headless("--robots", 1, timeout=1)
     assert code == 1

@@ -66,6 +66,35 @@ def test_lanes_need_the_width_of_the_robots(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "given",
+    [
+        "lanes:\n  - {name: a, path: [0, 2]}\n",
+        '{"lanes": [{"name": "a", "path": [0, 2]}]}',
+        {"lanes": [{"name": "a", "path": [0, 2]}]},
+    ],
+    ids=["yaml", "json", "mapping"],
+)
+def test_lanes_may_be_given_without_a_file(given: object) -> None:
+    lanes, remarks = read_lane_graph({"lanes": given}, GridMap(), 0.22)
+    assert lanes is not None
+    assert ([lane.cells for lane in lanes.lanes], remarks) == ([(0, 1, 2)], [])
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ("lanes:\n  - path: [0, 9]\n", "the parameter lanes: lanes[0].path[1]: cell 9 is neither"),
+        ("{lanes: [", "the parameter lanes, line 1: not YAML or JSON"),
+        ({"lane": []}, "the parameter lanes: the file: unknown key 'lane'"),
+        ([0, 2], "the parameter lanes: the file: expected keys and values, found [0, 2]"),
+    ],
+)
+def test_bad_lanes_without_a_file_are_named(given: object, text: str) -> None:
+    with pytest.raises(LanesError, match=re.escape(text)):
+        read_lane_graph({"lanes": given}, GridMap(), 0.22)
+
+
+@pytest.mark.parametrize(
     ("values", "text"),
     [
         ({"rows": -2}, "at least one row and one column, not -2 x 8"),
