@@ -49,9 +49,9 @@ class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     copy: bool = False
     """Whether this end belongs to such a copy: it is silent until this is no longer set."""
     epoch: int = 0
-    """How often this end's endpoint was placed; the dialing end says it."""
+    """Of the dialing end: grows whenever its endpoint gets another place; 0 is unknown."""
     peer_epoch: int = 0
-    """The same of the peer: the accepting end takes no link of a place that the peer has left."""
+    """Of the accepting end: it takes no link of a place with a lower epoch, which the peer has left."""
 
 
 class ConnectionSpec(Struct, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@
     LinkError
     +-- ProtocolError             the peer broke the rules of the frames; the connection is dropped
     +-- LinkRefusedError          the accepting end refused the dialing end
+        +-- FormerPlaceError      the dialing end is where its endpoint was before
     +-- LinkLostError             the connection of a link ended
     +-- InterfaceError            an interface cannot be made or started as its spec says
     +-- CallError                 a service call got no answer
@@ -29,6 +30,10 @@ class ProtocolError(LinkError):
 
 class LinkRefusedError(LinkError):
     """The accepting end refused the dialing end; the text is its reason."""
+
+
+class FormerPlaceError(LinkRefusedError):
+    """The dialing end is where its endpoint was before."""
 
 
 class LinkLostError(LinkError):

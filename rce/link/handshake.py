@@ -23,7 +23,7 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the dialing end is a copy: the connection is to stand beside the accepting end's present one,
     also if that one is down."""
     epoch: int | None = None
-    """How often the dialing end's endpoint was placed; not said by the versions before."""
+    """Of the dialing end's place; None if it does not know that of its endpoint, as releases before."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard import Guest, Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
-from rce.link.exceptions import LinkError, LinkLostError, LinkRefusedError
+from rce.link.exceptions import FormerPlaceError, LinkError, LinkLostError, LinkRefusedError
 from rce.link.frames import Frame, FrameType, encode
 from rce.link.handover import LinkAcceptor
 from rce.link.handshake import Hello, check_answer, encode_hello, encode_welcome, parse_hello
@@ -227,7 +227,7 @@ class LinkHub:
         """
         local = self._accepting.get(spec.id)
         if local is not None:
-            _check(local, spec.token, spec.epoch)
+            _check(local, spec.token, spec.epoch or None)
             ours, theirs = LocalCarrier.pair()
             local.accept(theirs, standby=standby, copy=spec.copy)
             return ours
@@ -277,8 +277,8 @@ class LinkHub:
     async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec, *, standby: bool) -> Carrier:
         """Shake hands as the dialing end."""
         try:
-            hello = encode_hello(spec.id, spec.token, standby=standby, copy=spec.copy, epoch=spec.epoch)
-            carrier.greet(hello)
+            epoch = spec.epoch or None
+            carrier.greet(encode_hello(spec.id, spec.token, standby=standby, copy=spec.copy, epoch=epoch))
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
@@ -322,10 +322,12 @@ class LinkHub:
             async with asyncio.timeout(self.timeouts.handshake):
                 hello = parse_hello(await carrier.handshake_frame())
                 link = await self._find(hello)
+        except FormerPlaceError as error:
+            _log.info("link refused: %s", error)
+            self._refuse(carrier, b"the endpoint is somewhere else now")
         except LinkRefusedError as error:
             _log.warning("link refused: %s", error)
-            carrier.greet(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
-            carrier.close()
+            self._refuse(carrier, b"unknown link or wrong token")
         except (LinkError, TimeoutError) as error:
             _log.info("no handshake: %s", str(error) or "it took too long")
             carrier.abort(LinkLostError("no handshake"))
@@ -338,6 +340,10 @@ class LinkHub:
             link.accept(carrier, standby=hello.standby, copy=hello.copy)
         finally:
             guest.leave()
+
+    def _refuse(self, carrier: SocketCarrier, why: bytes) -> None:
+        carrier.greet(encode(Frame(FrameType.REFUSE, payload=why)))
+        carrier.close()
 
     async def _adopt_secure(self, sock: socket.socket, link_id: str) -> None:
         """Begin TLS as the accepting end; then continue as with any other connection."""
@@ -369,4 +375,4 @@ def _check(link: Link, token: str, epoch: int | None) -> None:
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
         raise LinkRefusedError(f"wrong token for link {link.spec.id!r}")
     if epoch is not None and epoch < link.spec.peer_epoch:
-        raise LinkRefusedError(f"link {link.spec.id!r}: {link.spec.peer} is somewhere else now")
+        raise FormerPlaceError(f"link {link.spec.id!r}: {link.spec.peer} is somewhere else now")

@@ -172,6 +172,8 @@ class Takeovers:
         former = self._links[link_id]
         _log.debug("link %s to %s: the peer was moved", link_id, link.spec.peer)
         link.is_standby = False
+        # The spec that names the new places may have come while the link stood by.
+        link.spec = replace(link.spec, epoch=former.spec.epoch, peer_epoch=former.spec.peer_epoch)
         self._links.exchange(former, link)
         for channel in former:
             twin = link.get(channel.number)

@@ -24,7 +24,7 @@ from rce.own_process import end_signals
 from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.modes import start_demo
-from rce_fleet.demo.random_goals import send_random_goals
+from rce_fleet.demo.random_goals import RandomGoals, send_random_goals
 from rce_fleet.demo.resources import ANY, MAX_PORT, Ports, run_folder
 from rce_fleet.demo.scenario import MANY, choose_scenario, find_lanes, lane_scenario
 from rce_fleet.demo.worlds import NamedWorld, find_world, on_lanes
@@ -76,7 +76,8 @@ def demo(
         int | None,
         typer.Option(
             min=0,
-            help="Cells to block in a headless run [1; 0 with light robots]; fewer if goals are cut off.",
+            help="Cells that a headless run blocks [1; 0 with light robots or lanes];"
+            " fewer if goals are cut off.",
         ),
     ] = None,
     world: Annotated[
@@ -347,8 +348,9 @@ async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: b
             say(f"press {KEY} to kill the leading master")
         station = StationClient(session, demo.page)
         rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
+        goals = RandomGoals(rng, None if config.lanes is None else config.goal_cells)
         await demo.group.run_while_alive(
-            send_random_goals(station, rng, say, has_manager=config.mode is Mode.CLOUD)
+            send_random_goals(station, goals, say, has_manager=config.mode is Mode.CLOUD)
             if auto
             else _wait_until_cancelled()
         )

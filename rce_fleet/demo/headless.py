@@ -260,7 +260,9 @@ class _HeadlessRun:
         config, world = self._config, self._config.world
         cells: Sequence[int] = [] if world is None else [*world.docks, *world.shelves]
         rng = Random(config.seed)  # noqa: S311 - for tasks, not for secrets
-        cells, robots = cells or config.goal_cells, len(config.scenario.robots)
+        robots = len(config.scenario.robots)
+        if not cells or (config.lanes is not None and len(cells) < 2 * robots):  # few may be on lanes
+            cells = config.goal_cells
         stream: TaskStream = (
             ManagerTasks(demo.page, cells, rng, robots)
             if config.tasks is TaskSource.MANAGER

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from random import Random
 
 from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
@@ -26,10 +26,12 @@ class RandomGoals:
 
     Args:
         rng: Source of the goals.
+        among: The cells that are goals; None: all.
     """
 
-    def __init__(self, rng: Random) -> None:
+    def __init__(self, rng: Random, among: Collection[int] | None = None) -> None:
         self._rng = rng
+        self._among = among
         self._given: dict[str, int] = {}
         self._sent: dict[str, int] = {}
         self._idle_since: dict[str, float] = {}
@@ -75,7 +77,8 @@ class RandomGoals:
         taken = {*fleet.blocked, *fleet.pending, *goals.values()}
         for robot in fleet.robots:
             taken.update(cell for cell in (robot.goal, robot.cell) if cell is not None)
-        free = [cell for cell in range(fleet.map.rows * fleet.map.columns) if cell not in taken]
+        cells = range(fleet.map.rows * fleet.map.columns) if self._among is None else self._among
+        free = [cell for cell in cells if cell not in taken]
         return self._rng.choice(free) if free else None
 
 
@@ -107,17 +110,21 @@ async def send_goals(station: StationClient, chooser: RandomGoals, *, has_manage
 
 
 async def send_random_goals(
-    station: StationClient, rng: Random, say: Callable[[str], None], *, has_manager: bool
+    station: StationClient,
+    chooser: RandomGoals,
+    say: Callable[[str], None],
+    *,
+    has_manager: bool,
 ) -> None:
     """Send random goals until cancelled.
 
     Args:
         station: The station's API.
-        rng: Source of the goals.
+        chooser: Chooses the goals.
         say: Prints a line for the user.
         has_manager: Whether a fleet manager gives tasks to the robots.
     """
-    chooser, told = RandomGoals(rng), frozenset[str]()
+    told = frozenset[str]()
     while True:
         with contextlib.suppress(StationUnavailableError):
             await send_goals(station, chooser, has_manager=has_manager)

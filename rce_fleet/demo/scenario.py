@@ -17,6 +17,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lane_files import read_lanes
 from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.movingai import read_scenario
+from rce_fleet.planning.planner import PlanningProblem, load_planner
 from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario, spread_scenario
 
 MIN_LONGEST_PATH = 6
@@ -24,6 +25,7 @@ MIN_LONGEST_PATH = 6
 MANY = 20
 """Scenarios of more robots have no boxes, and no joint plan is made to see whether they can be solved."""
 _MAX_DRAWS = 1000
+_MAX_LANE_DRAWS = 100
 
 
 def choose_scenario(robots: int, seed: int, *, grid: GridMap = FLOOR, scen: Path | None = None) -> Scenario:
@@ -97,17 +99,31 @@ def lane_scenario(
         DemoError: A file cannot be read, the robots do not fit on the lanes, or a start or goal is on none.
     """
     part = lanes.connected_part()
+    if len(part) < 2:  # noqa: PLR2004 - a start and a goal
+        raise DemoError("--lanes: from no cell lanes lead to another one and back; close them to a ring")
     if scen is not None:
         found = choose_scenario(robots, seed, grid=grid, scen=scen)
         for cell in (*found.starts, *found.goals):
             if cell not in part:
                 raise DemoError(f"{scen}: from cell {cell} lanes do not lead to all others and back")
         return found
+    ways = grid.with_blocked(cell for cell in range(len(grid)) if cell not in part)
+    rng = Random(seed)  # noqa: S311 - for scenarios, not for secrets
     with _name_source("--lanes"):
-        found = spread_scenario(
-            grid.with_blocked(cell for cell in range(len(grid)) if cell not in part), robots, seed=seed
-        )
-    return replace(found, grid=grid)
+        for _ in range(_MAX_LANE_DRAWS):
+            found = replace(spread_scenario(ways, robots, seed=rng.getrandbits(32)), grid=grid)
+            if robots > MANY or _is_solvable(found, lanes):
+                return found
+    raise DemoError(
+        f"--lanes: found no starts and goals from which all {robots} robots can reach their goals; take fewer"
+        " robots, or add bays beside the lanes"
+    )
+
+
+def _is_solvable(scenario: Scenario, lanes: LaneGraph) -> bool:
+    """Whether a plan was found by which all robots are at their goals at the same time."""
+    problem = PlanningProblem.of(lanes.graph(scenario.grid), starts=scenario.starts, goals=scenario.goals)
+    return load_planner("lacam").plan(problem).complete
 
 
 @contextmanager

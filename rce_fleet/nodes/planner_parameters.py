@@ -87,8 +87,8 @@ def read_lane_graph(
     Raises:
         LanesError: The file cannot be read, its lanes cannot be driven on the grid, or all are too narrow.
     """
-    given = values.get("lanes")
-    if not given:
+    given = values.get("lanes", "")
+    if given == "":
         return None, []
     source = "the parameter lanes"
     if not isinstance(given, str):

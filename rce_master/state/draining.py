@@ -263,7 +263,7 @@ def _begin(tx: Transaction, container: Container, to: str) -> None:
     if container.resources.volumes:
         volume_moves.begin(tx, container, to)
         return
-    tx.put(Move(id=container.id, to=to, since=tx.now))
+    tx.put(Move(id=container.id, to=to, epoch=endpoints.new_epoch(tx), since=tx.now))
     tx.put(replace(tx.tables.container_live(container.id), stays=""))
     tx.touch(container.id)
     tx.happen("container_moving", container.id, f"from {container.task_set} to {to}")
@@ -370,7 +370,8 @@ _PHASES = {EndpointState.RUNNING: ContainerEvent.RUNNING, EndpointState.DEGRADED
 def _settle(tx: Transaction, container: Container, move: Move) -> None:
     if move.status is not None:
         container = replace(container, address=move.status.address)
-    endpoints.assign(tx, container, move.to)
+    endpoints.assign(tx, container, move.to, epoch=move.epoch)
+    endpoints.touch_dialers(tx, move.id)
     placing.happened(tx, move.id, ContainerEvent.PLACE)
 
 

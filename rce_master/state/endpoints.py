@@ -20,6 +20,8 @@ _REMOVAL = 100
 """The work of removing an endpoint or a connection, as :attr:`StateSettings.max_work` counts it."""
 _INTERFACE = 10
 """The work of removing an interface."""
+_TOUCH = 10
+"""The work of telling a peer of a place."""
 _SMALL = 32 * 2**10
 """Endpoints up to this size are not checked: their number limits them sufficiently."""
 
@@ -86,17 +88,31 @@ def remove_connection(tx: Transaction, connection: Connection) -> None:
             tx.touch_link(endpoint, connection.link)
 
 
-def assign(tx: Transaction, endpoint: Endpoint, process: str) -> None:
+def new_epoch(tx: Transaction) -> int:
+    """Return an epoch that is greater than all before, also those after a backup that was restored."""
+    return tx.next_number("revision")
+
+
+def assign(tx: Transaction, endpoint: Endpoint, process: str, *, epoch: int = 0) -> None:
     """Make a task set responsible for an endpoint; it was not before.
 
-    Peers take no links from its former place any more, which may not know that it was left: a machine that
-    hung or was cut off continues to dial when it comes back.
+    Peers that it dials take no links from its former place any more, which may not know that it was left: a
+    machine that hung or was cut off continues to dial when it comes back.
+
+    Args:
+        tx: The transaction.
+        endpoint: The endpoint.
+        process: The task set.
+        epoch: The endpoint's there; 0: a new one.
     """
-    tx.put(msgspec.structs.replace(endpoint, task_set=process, epoch=endpoint.epoch + 1))
+    tx.put(msgspec.structs.replace(endpoint, task_set=process, epoch=epoch or new_epoch(tx)))
     tx.touch(endpoint.id)
     for link in tx.tables.links.by("endpoint", endpoint.id):
-        for end in (link.a, link.b):
-            tx.touch_link(end, link.id)
+        peer = link.peer(endpoint.id)
+        if peer != endpoint.id and dials(tx.tables, link, endpoint.id):
+            tx.touch_link(endpoint.id, link.id)
+            tx.touch_link(peer, link.id)
+            tx.spend(_TOUCH)
 
 
 def withdraw(tx: Transaction, endpoint: Endpoint, reason: str, *, elsewhere: bool = False) -> None:

@@ -33,7 +33,7 @@ class _Endpoint(Struct, frozen=True, kw_only=True):
     task_set: str = ""
     """Process name of the task set that is responsible; empty: none."""
     epoch: int = 0
-    """Grows with each task set that becomes responsible: what still comes from former ones has less."""
+    """Grows with each task set that becomes responsible: what still dials from former ones says less."""
     size: int = 0
     """Bytes of its contents, as :func:`rce_master.state.endpoints.size_of` counts them."""
 
@@ -170,6 +170,8 @@ class Move(Struct, frozen=True, kw_only=True):
     to: str
     """Process name of the task set that was told to make its copy."""
     since: float
+    epoch: int = 0
+    """The container's when the copy has taken over."""
     status: EndpointStatus | None = None
     """What is reported of the copy."""
     linking_since: float | None = None

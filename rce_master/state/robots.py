@@ -89,6 +89,7 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
         if robot.task_set:
             endpoints.withdraw(tx, robot, "the robot connected elsewhere")
         endpoints.assign(tx, robot, process)
+        endpoints.touch_dialers(tx, id_)
     tx.put(replace(tx.tables.endpoints[id_], credential=command.credential))
     tx.put(replace(live.after(RobotEvent.LOGIN, tx.now), status=None))
     activity.forget(tx, id_)

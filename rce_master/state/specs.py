@@ -28,15 +28,15 @@ def build_copy_spec(tables: Tables, id_: str) -> EndpointSpec:
     if tables.moves[id_].linking_since is None:
         return build_spec(tables, id_, with_wiring=False)
     spec = build_spec(tables, id_)
-    links = (_copy_end(tables, link) for link in spec.links)
-    return replace(spec, links=tuple(links))
+    epoch = tables.moves[id_].epoch
+    return replace(spec, links=tuple(_copy_end(tables, link, epoch) for link in spec.links))
 
 
-def _copy_end(tables: Tables, link: LinkSpec) -> LinkSpec:
+def _copy_end(tables: Tables, link: LinkSpec, epoch: int) -> LinkSpec:
     """Return a copy's end of a link; the copies of two containers that move together are linked."""
     peer = _copy_address(tables, link.peer)
     address = peer if link.dial and peer is not None else link.address
-    return replace(link, copy=True, address=address, next=None, epoch=link.epoch + 1)
+    return replace(link, copy=True, address=address, next=None, epoch=epoch if link.dial else 0)
 
 
 def _copy_address(tables: Tables, id_: str) -> LinkAddress | None:
@@ -140,8 +140,8 @@ def link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
         dial=dial,
         address=endpoints.address(tables, peer) if dial else LinkAddress(),
         next=_copy_address(tables, peer) if dial and not moves_too else None,
-        epoch=tables.endpoints[id_].epoch,
-        peer_epoch=tables.endpoints[peer].epoch,
+        epoch=tables.endpoints[id_].epoch if dial else 0,
+        peer_epoch=0 if dial or peer == id_ else tables.endpoints[peer].epoch,
     )
 
 

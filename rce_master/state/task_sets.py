@@ -312,7 +312,9 @@ def _expire(tx: Transaction, presence: Presence) -> None:
     if tx.now - presence.since < grace:
         return
     for endpoint in tx.tables.endpoints.by("task_set", presence.process):
-        if isinstance(endpoint, Container):
+        # One that moved together with a lost one is at its new place already.
+        is_there = tx.tables.endpoints[endpoint.id].task_set == presence.process
+        if isinstance(endpoint, Container) and is_there:
             if tx.is_out_of_work():
                 return
             tx.spend(_LOSS)

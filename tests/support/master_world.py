@@ -144,3 +144,16 @@ class World:
         self.interface("rob/out", "SubscriberConverter")
         self.interface("c/in", "PublisherInterface")
         self.connect("rob/out", "c/in")
+
+
+def restarted(world: World, revision: int = 0) -> World:
+    snapshot: dict[str, dict[str, bytes]] = {
+        table.name: {table.key(r): table.encode(r) for r in table}
+        for table in world.state.tables.all
+        if table.persistent
+    }
+    new = World.__new__(World)
+    new.now = world.now + 1
+    new.state = State.load(snapshot, new.now, revision=revision)
+    new.state.validate()
+    return new

@@ -55,14 +55,15 @@ async def test_former_place_does_not_get_its_link_back(rig: Rig, way: str) -> No
     """A machine that hung dials when it wakes, before it hears that its endpoint was placed elsewhere."""
     former, b = await rig.pair(way)
     await rig.join(former, b, [TOPIC_OUT])
+    await former.apply(links=[replace(former.spec.links[0], epoch=1)])
     await former.connected(1)
+    await b.apply(links=[replace(b.spec.links[0], peer_epoch=2)])
     present = rig.party("a", former.hub if way == "local" else await rig.hub())
     (link,) = former.spec.links
     await present.apply({"i1": TOPIC_OUT[0]}, [replace(link, epoch=2)], list(former.spec.connections))
     await present.connected(1)
-    await b.apply(links=[replace(b.spec.links[0], peer_epoch=2)])
     with pytest.raises(LinkRefusedError):
-        await former.hub.connect(replace(link, epoch=1))
+        await former.hub.connect(link)
     await former.connected()
     assert present.endpoint.connections == b.endpoint.connections == (1,)
     assert present.fakes["i1"].active == [True]

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from support.link_kinds import SERVICE_OUT, TOPIC_IN, TOPIC_OUT
 
 from rce.control.model import LinkAddress, LinkSpec
-from rce.link import LinkLostError
+from rce.link import LinkLostError, LinkRefusedError
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig
@@ -100,6 +100,35 @@ async def test_takeover_loses_nothing(move: Move, *, robot_dials: bool) -> None:
     assert former.fakes["i1"].received.empty()
     assert robot.endpoint.connections == ALL
     assert [robot.fakes[tag].active for tag in ("i1", "i2", "i3")] == [[True]] * 3
+
+
+@pytest.mark.parametrize("robot_dials", [False], ids=["peer-dials"])
+@pytest.mark.parametrize("is_told_first", [True, False])
+async def test_former_place_is_refused_after_the_takeover(
+    move: Move, *, robot_dials: bool, is_told_first: bool
+) -> None:
+    """The accepting end hears of the new place from the master before the copy takes over, or after."""
+    robot, former, copy = move.robot, move.former, move.copy
+    (end,) = former.spec.links
+    await former.apply(links=[replace(end, epoch=1)])
+    await move.begin(robot_dials=robot_dials)
+    (own,), (accepting,) = copy.spec.links, robot.spec.links
+    await copy.apply(links=[replace(own, epoch=2)])
+
+    async def tell() -> None:
+        await robot.apply(links=[replace(accepting, peer_epoch=2)])
+
+    if is_told_first:
+        await tell()
+    await move.take_over()
+    copy.fakes["i2"].port.send(b"from the new place")
+    await robot.fakes["i2"].received.get()
+    if not is_told_first:
+        await tell()
+    await former.connected()
+    with pytest.raises(LinkRefusedError, match="the endpoint is somewhere else now"):
+        await former.hub.connect(former.spec.links[0])
+    assert await robot.fakes["i3"].port.call(b"still there") == b"STILL THERE"
 
 
 async def test_latched_messages_reach_the_new_place(move: Move, *, robot_dials: bool) -> None:

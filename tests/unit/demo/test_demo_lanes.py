@@ -17,6 +17,7 @@ from rce_fleet.nodes.planner_parameters import read_lane_graph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import LaneGraph
 from rce_fleet.planning.planner import PlanningProblem, load_planner
+from rce_fleet.planning.scenario import Scenario
 
 EXAMPLE = Path(__file__).parents[3] / "configs" / "lanes.yaml"
 RING = "{name: ring, path: [0, 3, 11, 8, 0], one_way: true}"
@@ -28,6 +29,12 @@ def found(file: Path, grid: GridMap = FLOOR) -> LaneGraph:
     lanes = find_lanes(file, grid, slam=False, blocked_cells=None)
     assert lanes is not None
     return lanes
+
+
+def all_arrive(scenario: Scenario, lanes: LaneGraph) -> bool:
+    graph = lanes.graph(scenario.grid)
+    problem = PlanningProblem.of(graph, starts=scenario.starts, goals=scenario.goals)
+    return load_planner("lacam").plan(problem).complete
 
 
 def test_the_example_is_for_the_demos_floor() -> None:
@@ -45,8 +52,7 @@ def test_robots_start_on_lanes_and_can_reach_their_goals(seed: int) -> None:
     assert scenario == lane_scenario(3, seed, grid=FLOOR, lanes=lanes)
     assert scenario.grid == FLOOR
     assert not scenario.boxes
-    problem = PlanningProblem.of(lanes.graph(FLOOR), starts=scenario.starts, goals=scenario.goals)
-    assert load_planner("lacam").plan(problem).complete
+    assert all_arrive(scenario, lanes)
 
 
 def test_the_planner_gets_the_lanes_themselves() -> None:
@@ -72,8 +78,10 @@ def test_lanes_that_lead_away_are_no_goals(tmp_path: Path) -> None:
     file.write_text(f"lanes: [{RING}, {{path: [3, 5], one_way: true}}, {{path: [14, 11], one_way: true}}]")
     lanes = found(file, GRID)
     assert lanes.connected_part() == {0, 1, 2, 3, 8, 9, 10, 11}
-    scenario = lane_scenario(4, 0, grid=GRID, lanes=lanes)
-    assert {*scenario.starts, *scenario.goals} <= lanes.connected_part()
+    for seed in range(8):
+        scenario = lane_scenario(3, seed, grid=GRID, lanes=lanes)
+        assert {*scenario.starts, *scenario.goals} <= lanes.connected_part()
+        assert all_arrive(scenario, lanes), "on a ring no robot can pass another one"
     with pytest.raises(DemoError, match=re.escape("--lanes: 5 robots do not fit into 8 cells")):
         lane_scenario(5, 0, grid=GRID, lanes=lanes)
 
@@ -88,6 +96,23 @@ def test_starts_and_goals_of_a_file_are_on_lanes(tmp_path: Path) -> None:
     scen.write_text(SCEN.format(start=0, goal=5))
     with pytest.raises(DemoError, match=r"m\.scen: from cell \d+ lanes do not lead to all others and back"):
         lane_scenario(1, 0, grid=GRID, lanes=lanes, scen=scen)
+
+
+def test_lanes_without_a_way_back_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "lanes.yaml"
+    file.write_text("lanes: [{path: [0, 3], one_way: true}]")
+    with pytest.raises(DemoError, match="from no cell lanes lead to another one and back"):
+        lane_scenario(1, 0, grid=GRID, lanes=found(file, GRID))
+
+
+def test_robots_that_cannot_pass_each_other_keep_their_order(tmp_path: Path) -> None:
+    """On a lane without a bay."""
+    file = tmp_path / "lanes.yaml"
+    file.write_text("lanes: [{path: [0, 3]}]")
+    scenario = lane_scenario(2, 0, grid=GRID, lanes=found(file, GRID))
+    assert all_arrive(scenario, found(file, GRID))
+    with pytest.raises(DemoError, match="robots do not fit into 4 cells"):
+        lane_scenario(3, 0, grid=GRID, lanes=found(file, GRID))
 
 
 def test_docks_and_chargers_beside_lanes_are_not_used(tmp_path: Path) -> None:

@@ -107,3 +107,9 @@ def test_no_random_goal_is_sent_while_tasks_are_open() -> None:
         station = OneRobotStation(has_tasks=has_tasks)
         assert asyncio.run(send_goals(station, RandomGoals(Random(0)), has_manager=has_manager)) == expected
         assert station.goals == expected
+
+
+def test_goals_are_among_the_cells_that_were_given() -> None:
+    chooser = RandomGoals(Random(0), [3])
+    assert chooser.update(fleet(robot("a", cell=0), size=2), 0.0) == {"a": 3}
+    assert RandomGoals(Random(0), [3]).update(fleet(robot("a", cell=3), size=2), 0.0) == {}

@@ -87,6 +87,9 @@ def test_lanes_may_be_given_without_a_file(given: object) -> None:
         ("{lanes: [", "the parameter lanes, line 1: not YAML or JSON"),
         ({"lane": []}, "the parameter lanes: the file: unknown key 'lane'"),
         ([0, 2], "the parameter lanes: the file: expected keys and values, found [0, 2]"),
+        ({}, "the parameter lanes: lanes: expected a list of lanes"),
+        ([], "the parameter lanes: the file: expected keys and values, found []"),
+        (False, "the parameter lanes: the file: expected keys and values, found False"),
     ],
 )
 def test_bad_lanes_without_a_file_are_named(given: object, text: str) -> None:

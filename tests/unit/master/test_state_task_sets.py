@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.master_world import World
+from support.master_world import World, restarted
 from support.state_reports import MB, kinds, status
 
 from rce.control.model import (
@@ -15,7 +15,6 @@ from rce.control.model import (
 )
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError, TransitionError
 from rce_master.state import commands
-from rce_master.state.core import State
 from rce_master.state.lifecycle import (
     CONTAINER_LIFE,
     ROBOT_LIFE,
@@ -199,19 +198,6 @@ def test_a_machine_that_lost_its_containers_makes_them_again(world: World) -> No
 
 
 # A restarted master
-
-
-def restarted(world: World, revision: int = 0) -> World:
-    snapshot: dict[str, dict[str, bytes]] = {
-        table.name: {table.key(r): table.encode(r) for r in table}
-        for table in world.state.tables.all
-        if table.persistent
-    }
-    new = World.__new__(World)
-    new.now = world.now + 1
-    new.state = State.load(snapshot, new.now, revision=revision)
-    new.state.validate()
-    return new
 
 
 def test_a_restarted_master_desires_the_same(world: World) -> None:
