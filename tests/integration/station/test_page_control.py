@@ -135,6 +135,7 @@ async def test_a_stop_of_all_robots_is_one_row() -> None:
     async with site(robots=12) as made, opened(made) as page:
         await page.locator("#stop-all").click()
         group = page.locator("#attention-list li", has_text="11 robots:")
+        await made.until(lambda: made.control.undelivered == ["Robot2"])
         await group.wait_for()
         rows = page.locator("#attention-list li")
         assert await rows.count() == 2

@@ -121,7 +121,9 @@ async def site(authenticator: Authenticator | None = None, robots: int = 2) -> A
         )
         login = Login()
         station = Station(view, fleet, feed.pages, authenticator=authenticator or login, control=control)  # type: ignore[arg-type]  # as wide as what is called
-        async with TestClient(TestServer(station.make_app())) as client:
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(control.close)
+            client = await stack.enter_async_context(TestClient(TestServer(station.make_app())))
             made = Site(client, fleet, control, view, login, station)
             await node.subscribe(
                 "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
@@ -137,7 +139,6 @@ async def site(authenticator: Authenticator | None = None, robots: int = 2) -> A
                 "/Robot1/initialpose", "geometry_msgs/PoseWithCovarianceStamped", made.poses.append
             )
             yield made
-        await control.close()
 
 
 class Engine:
