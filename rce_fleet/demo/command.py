@@ -168,8 +168,9 @@ def demo(
             raise DemoError("--slam maps on the robot: use it without --offload")
         _check_replicas(replicas, mode)
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
-        ways = find_lanes(lanes, find_world(world).grid, slam=slam, blocked_cells=blocked_cells)
-        fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen, ways)
+        floor = find_world(world)
+        ways = find_lanes(lanes, floor.grid, slam=slam, blocked_cells=blocked_cells)
+        fleet = _choose_fleet(count, full_stack, floor, seed, scen, ways)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
         _check_duration(duration, timeout, mode, headless=headless)
         if report is not None and headless:

@@ -1,4 +1,4 @@
-"""The demo's scenario: map, starts and goals, drawn from a seed or read from MovingAI files."""
+"""The demo's scenario: map, lanes, starts and goals, drawn from a seed or read from files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def find_lanes(
     Args:
         file: YAML or JSON; None: there are no lanes.
         grid: The cells.
-        slam: Whether there is no map at the start.
+        slam: Whether the demo begins without a map.
         blocked_cells: How many cells are to be blocked, if that was given.
 
     Returns:

@@ -50,6 +50,16 @@ def agree(world: World) -> int:
     return link(world, "a").epoch
 
 
+def begin_move(world: World) -> int:
+    """Let a's copy at m3 make its links, beside the established ones; return the connection."""
+    (number,) = (one.id for one in world.spec("a").connections)
+    report(world, "a", "c1", (number,))
+    report(world, "b", "c2", (number,))
+    world.do(commands.MoveContainer(user="anna", tag="a", machine="m3"))
+    report(world, "a", "c3")
+    return number
+
+
 @pytest.fixture
 def pair() -> World:
     """Container a at machine m1 and b at m2, which it dials, and an empty machine m3."""
@@ -91,11 +101,7 @@ def test_accepting_container_made_elsewhere_tells_its_peer_nothing(pair: World) 
 
 def test_copy_has_the_epoch_that_its_container_will_have(pair: World) -> None:
     former = agree(pair)
-    (number,) = (one.id for one in pair.spec("a").connections)
-    report(pair, "a", "c1", (number,))
-    report(pair, "b", "c2", (number,))
-    pair.do(commands.MoveContainer(user="anna", tag="a", machine="m3"))
-    report(pair, "a", "c3")
+    number = begin_move(pair)
     copy = copy_link(pair)
     assert agree(pair) == former < copy.epoch, "the present place is not refused before the copy takes over"
     report(pair, "a", "c3", (number,))
@@ -105,11 +111,7 @@ def test_copy_has_the_epoch_that_its_container_will_have(pair: World) -> None:
 
 def test_each_copy_has_an_epoch_of_its_own(pair: World) -> None:
     """One that was given up, and is cut off, is not taken for the next one."""
-    (number,) = (one.id for one in pair.spec("a").connections)
-    report(pair, "a", "c1", (number,))
-    report(pair, "b", "c2", (number,))
-    pair.do(commands.MoveContainer(user="anna", tag="a", machine="m3"))
-    report(pair, "a", "c3")
+    begin_move(pair)
     first = copy_link(pair)
     pair.leave("c3")
     pair.container_set("c4", name="m4", slots=4)
