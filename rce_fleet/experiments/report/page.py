@@ -26,7 +26,7 @@ from rce_fleet.experiments.report.parts import (
 from rce_fleet.experiments.report.repeat import compare
 from rce_fleet.experiments.report.repeat_part import comparison_text
 from rce_fleet.experiments.report.schematics import schematics
-from rce_fleet.experiments.report.sections import LIMITS, LINK, READING, SECTIONS
+from rce_fleet.experiments.report.sections import LINK, READING, SECTIONS, limits
 from rce_fleet.experiments.report.summary import Summary, read_summary, summarize, write_summary
 from rce_fleet.experiments.report.tables import folded, metric_table, table_of, unlisted
 
@@ -137,7 +137,7 @@ def page_text(
         parts += _section(measurements, section.experiment, drawings.get(section.experiment, ()), figures)
     parts += ["## Other data", _other(measurements)]
     parts += ["## Another full run", _repeated(measurements, environments, again)]
-    parts += ["## Limits", LIMITS]
+    parts += ["## Limits", limits()]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
 

@@ -182,7 +182,10 @@ READING = f"""\
 - *CPU* is in cores: 1.0 is one core. `link.cpu` is that of the emulated link, and is in no machine's CPU.
 """
 
-LIMITS = f"""\
+
+def limits() -> str:
+    """Return what the measurements cannot tell, as Markdown. It simulates for a second."""
+    return f"""\
 - Machines are network namespaces of one computer and share its cores: where they need more than there is,
   they slow each other down. Ratios carry over to other computers, absolute numbers do not.
 - The link is emulated: rate, delay and loss are those of a wireless LAN, but radio channels, roaming and
