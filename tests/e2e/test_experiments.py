@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import psutil
@@ -192,6 +193,7 @@ def refused(path: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
     return done
 
 
+@cache
 def described_commit() -> str:
     code = "from rce_fleet.experiments.environment import commit; print(commit())"
     return subprocess.run(
