@@ -66,6 +66,8 @@ class TaskProgress:
         self._retry_at: dict[int, float] = {}
         """When a robot tries again to bring a load for which it found no way, by task: until then its task is
         suspended, so that people can say where the load is."""
+        self._tried_since: dict[int, float] = {}
+        """Since when a task's robot has been sent to its stop, or has waited for the same reason; by task."""
         self._asked: dict[int, int] = {}
         """The stop before which people were asked for a load, by task."""
         self._warned: dict[int, int] = {}
@@ -103,6 +105,9 @@ class TaskProgress:
             {number: stop for number, stop in told.items() if number in self._book.tasks}
             for told in (self._asked, self._warned)
         )
+        self._tried_since = {
+            number: since for number, since in self._tried_since.items() if number in self._book.tasks
+        }
         for task in self._book.active_tasks():
             robot = facts.robots.get(task.robot)
             if task.state is TaskState.HELD:
@@ -220,6 +225,8 @@ class TaskProgress:
             return task
         if chosen is not None:
             self._taken[chosen] = robot.id
+            if task.target is None:
+                self._tried_since[task.number] = now
             sent = replace(task, target=chosen, revision=task.revision + 1, reason="")
             self._book.emit(sent, "sent", now, text=f"{robot.id} goes to cell {chosen}")
             return sent
@@ -231,12 +238,13 @@ class TaskProgress:
         else:
             reason = f"no cell is known for the stop {stop.action.value!r}: set chargers or parking places"
         if task.reason != reason:
+            self._tried_since[task.number] = now
             task = replace(task, reason=reason, revision=task.revision + 1)
             self._book.emit(task, "waits", now, text=f"{task.id} {reason}")
         if (
             not waits
             and (not task.is_loaded or task.state is TaskState.RUNNING)
-            and now - max(robot.moved_at, task.changed_at) > self._rules.unreachable_after
+            and self._waited(task, robot, now) > self._rules.unreachable_after
         ):
             self._give_up(task, now, reason)
             return self._book.tasks[task.number]
@@ -309,8 +317,12 @@ class TaskProgress:
 
     # Robots that cannot go on
 
+    def _waited(self, task: Task, robot: RobotFacts, now: float) -> float:
+        """Return for how long a robot has tried in vain to come nearer to its stop."""
+        return now - max(robot.moved_at, task.changed_at, self._tried_since.get(task.number, 0.0))
+
     def _check_trouble(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
-        waited = now - max(robot.moved_at, task.changed_at)
+        waited = self._waited(task, robot, now)
         if task.target in facts.shut and waited > self._rules.unreachable_after:
             self._give_up(task, now, f"cell {task.target} is blocked")
         elif robot.state == "unreachable" and waited > self._rules.unreachable_after:

@@ -35,6 +35,34 @@ def test_a_stuck_robots_task_goes_to_another(floor: Floor) -> None:
     assert any("has not left cell 0" in event.text for event in floor.events)
 
 
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_a_robot_that_acted_long_is_not_stuck(floor: Floor, is_loaded: bool) -> None:
+    """It has stood still in the cell of a stop, longer than a robot may that shall drive."""
+    floor.add("Robot1", 0)
+    floor.add("Robot2", 63)
+    long = Stop(Action.PICK if is_loaded else Action.GO, (3,), duration=150.0)
+    last = Stop(Action.DELIVER if is_loaded else Action.GO, (60,))
+    task = floor.book.create(Order((long, last)), floor.now)
+    floor.run_until_ended(task)
+    assert {visit.robot for visit in floor.task(task).visits} == {"Robot1"}
+    kinds = {event.kind for event in floor.events}
+    assert not kinds & {"suspended", "question", "released"}
+
+
+def test_a_robot_that_waited_for_its_cell_is_not_stuck(floor: Floor) -> None:
+    floor.add("Robot1", 0)
+    first = floor.add("Robot2", 63)
+    long = floor.book.create(Order((Stop(Action.GO, (61,), duration=200.0),), robot="Robot2"), floor.now)
+    floor.run(5)
+    assert first.cell == 61
+    task = floor.book.create(Order((Stop(Action.GO, (61,)),), robot="Robot1"), floor.now)
+    floor.run_until_ended(long)
+    floor.book.emit(RobotEntry("Robot2", mode="out_of_service"), "taken out", floor.now)
+    del floor.facts.robots["Robot2"]
+    floor.run_until_ended(task)
+    assert not any("has not left" in event.text for event in floor.events)
+
+
 @pytest.mark.parametrize("mode", ["dead", "out_of_service"])
 def test_a_robot_taken_out_gives_its_task_away(floor: Floor, mode: str) -> None:
     floor.add("Robot1", 0)
