@@ -48,7 +48,7 @@ class Conditions:
         ready = self.ready = []
         for task in self._book.open_tasks():
             order = task.order
-            if order.deadline is not None and not task.late and now >= order.deadline:
+            if order.deadline is not None and now >= order.deadline and (not task.late or _fails(task)):
                 if not self._may_change():
                     continue
                 task = self._pass_deadline(task, now)  # noqa: PLW2901 - the same task, changed
@@ -102,7 +102,7 @@ class Conditions:
         self._book.advance(task, TaskCause.FINISH, now, "all stops were made", robot=robot)
 
     def _pass_deadline(self, task: Task, now: float) -> Task:
-        if task.order.when_late is WhenLate.FAIL and task.state in _FAIL_WHEN_LATE and not task.visits:
+        if _fails(task):
             reason = "its deadline passed before a robot began with it"
             return self._book.advance(task, TaskCause.FAIL, now, reason, robot="", late=True)
         late = replace(task, late=True, revision=task.revision + 1)
@@ -131,3 +131,8 @@ class Conditions:
     def _wait(self, task: Task, reason: str, now: float) -> None:
         if task.reason != reason and self._may_change():
             self.note(task, reason, now)
+
+
+def _fails(task: Task) -> bool:
+    """Return whether a task ends at its deadline, or later: the robot that was under way may be lost."""
+    return task.order.when_late is WhenLate.FAIL and task.state in _FAIL_WHEN_LATE and not task.visits

@@ -217,6 +217,18 @@ def test_a_held_task_that_none_began_fails_at_its_deadline(floor: Floor, is_sent
     assert (floor.task(loaded).state, floor.task(loaded).late) == (TaskState.HELD, True)
 
 
+def test_a_task_fails_if_its_robot_is_lost_after_the_deadline(floor: Floor) -> None:
+    """The robot was under way in time; another one must not begin after the deadline."""
+    task = floor.go(63, deadline=floor.now + 5, when_late=WhenLate.FAIL)
+    first = floor.add("Robot1", 0)
+    floor.run(8)
+    assert (floor.task(task).state, floor.task(task).late) == (TaskState.RUNNING, True)
+    floor.add("Robot2", 40)
+    first.state, first.away_since = "silent", floor.now
+    floor.run(20)
+    assert (floor.task(task).state, floor.task(task).visits) == (TaskState.FAILED, ())
+
+
 def test_a_task_recurs_without_piling_up(floor: Floor) -> None:
     first = floor.go(1, every=10.0, occurrences=3)
     floor.run(45)  # no robot: occurrences that are due wait
