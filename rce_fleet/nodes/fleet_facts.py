@@ -16,6 +16,9 @@ from rce_fleet.tasks.records import TURNED_BY, PlannerRun
 _DETAILS = re.compile(r"[^(]*\((.*)\)")
 """A mode as a reason, with what a person gave as reason: ``paused (visitors, by anna)``."""
 
+FULL = 4
+"""``POWER_SUPPLY_STATUS_FULL`` of ``sensor_msgs/BatteryState``."""
+
 
 class FactKeeper:
     """Keeps the facts up to date. Messages are in their JSON form.
@@ -32,7 +35,7 @@ class FactKeeper:
         self._follower = ChangeFollower()
         self._blocked: set[int] = set()
         self._pending: set[int] = set()
-        self._batteries: dict[str, tuple[float | None, bool | None]] = {}
+        self._batteries: dict[str, float | None] = {}
         self._turned: tuple[Any, float] = (None, 0.0)
         """When a planner took its grid, and the direction of the grid's columns."""
         self.started: Any = None
@@ -126,17 +129,16 @@ class FactKeeper:
             percentage: Share, 0 .. 1; not a number if it is not measured.
             charge: Ampere hours that are left.
             capacity: Ampere hours of the full battery.
-            status: ``power_supply_status``: 1 charging, 4 full.
+            status: ``power_supply_status``; 4: it is full, also if it is worn and holds less than new.
         """
         share = percentage
         if not isfinite(share) and capacity > 0:
             share = charge / capacity
         level = min(1.0, max(0.0, share)) if isfinite(share) else None
-        charging = {0: None, 1: True, 4: True}.get(status, False)
-        self._batteries[robot] = level, charging
+        self._batteries[robot] = level = 1.0 if status == FULL else level
         known = self._facts.robots.get(robot)
         if known is not None:
-            known.battery, known.is_charging = level, charging
+            known.battery = level
 
     # Inner
 
@@ -168,8 +170,7 @@ class FactKeeper:
         name = robot["id"]
         known = self._facts.robots.get(name)
         if known is None:
-            battery, charging = self._batteries.get(name, (None, None))
-            known = RobotFacts(name, battery=battery, is_charging=charging, moved_at=now)
+            known = RobotFacts(name, battery=self._batteries.get(name), moved_at=now)
             self._facts.robots[name] = known
         cell = robot["cell"] if robot["cell"] >= 0 else None
         goal = robot["goal"] if robot["goal"] >= 0 else None

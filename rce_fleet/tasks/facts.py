@@ -34,7 +34,6 @@ class RobotFacts:
         cell: Its cell; None: not known.
         goal: Its goal in the planner; None: none.
         battery: Share of the full battery, 0 .. 1; None: not known.
-        is_charging: Whether it takes energy in; None: not known.
         moved_at: When its cell changed last, or it got its goal: seconds since 1970.
         away_since: Since when it has been silent, joining or not in the planner; ``inf``: it is there.
         by_hand: Whether it drives to a goal that a person or another program gave it.
@@ -49,7 +48,6 @@ class RobotFacts:
     cell: int | None = None
     goal: int | None = None
     battery: float | None = None
-    is_charging: bool | None = None
     moved_at: float = -inf
     away_since: float = inf
     by_hand: bool = False

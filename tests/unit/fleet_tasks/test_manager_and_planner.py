@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from rce.ros.types import Time
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.mirror import REFUSED_S
-from rce_fleet.nodes.fleet_facts import FactKeeper
+from rce_fleet.nodes.fleet_facts import FULL, FactKeeper
 from rce_fleet.nodes.state_publisher import state_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import Lane, LaneGraph
@@ -51,6 +52,25 @@ def test_lanes_come_from_the_planners_state() -> None:
     del state["lanes"]
     keeper.take_state({"sequence": 0, "state": {**state, "started": {"secs": 6, "nsecs": 0}}}, 2.0)
     assert facts.lanes is None
+
+
+@pytest.mark.parametrize(
+    ("percentage", "capacity", "status", "level"),
+    [
+        (0.6, 20.0, 1, 0.6),
+        (nan, 20.0, 1, 0.8),
+        (nan, 20.0, FULL, 1.0),
+        (0.93, 0.0, FULL, 1.0),
+        (nan, 0.0, 1, None),
+    ],
+)
+def test_a_battery_is_full_when_it_says_so(
+    percentage: float, capacity: float, status: int, level: float | None
+) -> None:
+    """A worn one holds 16 of 20 ampere hours then."""
+    facts = FleetFacts(robots={"Robot1": RobotFacts("Robot1")})
+    FactKeeper(facts).take_battery("Robot1", percentage, 16.0, capacity, status)
+    assert facts.robots["Robot1"].battery == level
 
 
 @pytest.mark.parametrize(
