@@ -126,14 +126,14 @@ class FleetManager:
 
     def _load(self) -> None:
         """Make the book from the journal."""
-        self.book = TaskBook()
-        records, self.book.number = self._journal.load()
-        self.book.last_task = self._journal.last_task
-        self.written = self.book.number
+        book = TaskBook()
+        records, book.number = self._journal.load()
+        book.last_task = self._journal.last_task
         for record in sorted(records, key=lambda each: each.number if isinstance(each, Task) else 0):
-            self.book.put_record(clamped(record))
-        self.book.grid = self.facts.grid
-        self.dispatcher = Dispatcher(self.book, self._rules)
+            book.put_record(clamped(record))
+        book.grid = self.facts.grid
+        self.book, self.written = book, book.number
+        self.dispatcher = Dispatcher(book, self._rules)
 
     def _reload(self) -> None:
         """Make the book from the journal again; if it cannot be read, that is tried again later."""
@@ -436,6 +436,11 @@ class FleetManager:
     def failure(self) -> str:
         """Why nothing can be accepted now; empty: it can."""
         return self._failure
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether nothing can be told of tasks: the book may have what could not be written."""
+        return self._is_stale
 
     @property
     def journal_id(self) -> str:

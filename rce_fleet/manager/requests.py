@@ -234,6 +234,8 @@ class Router:
         match, route = fitting[0]
         if route.changes and (refusal := self._refuse_change(request)) is not None:
             return refusal
+        if self._manager.is_stale:
+            return problem(507, self._manager.failure)
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         names = tuple(unquote(name) for name in match.groups())
         call = Call(self._manager, request, names, query, self._manager.clock())

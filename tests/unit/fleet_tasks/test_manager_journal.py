@@ -148,7 +148,9 @@ async def test_a_journal_that_cannot_be_read_is_read_later(
         patch.setattr(client.journal, "load", fail)
         assert (await client.ask("POST", "/tasks", GO))[0] == 507
         await client.manager.step()
+        assert (await client.ask("GET", "/tasks/T1"))[0] == 507
     await client.manager.step()
+    assert (await client.ask("GET", "/tasks/T1"))[0] == 200
     assert (client.manager.failure, list(client.manager.book.tasks)) == ("", [1])
     assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
     events = (await client.ask("GET", "/events"))[1]["events"]
