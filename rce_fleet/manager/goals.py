@@ -120,6 +120,11 @@ class GoalKeeper:
             out.append((robot.id, goal))
         return sorted(out, key=lambda pair: pair[1] is not None)
 
+    def is_newest(self, robot: str, cell: int | None) -> bool:
+        """Return whether a goal of :meth:`to_send` still counts: a person may have set another one."""
+        sent = self._sent.get(robot)
+        return sent is not None and sent.cell == cell
+
     def refused(self, robot: str) -> None:
         """Note that the planner refused a goal; it is sent again later."""
         if robot in self._sent:

@@ -39,6 +39,8 @@ class HandGoals:
         self._keeper = keeper
         self._asking: set[str] = set()
         """Robots whose goal the planner is asked to take over now."""
+        self._is_started_anew = False
+        """Whether the planner still has the goals that a manager before this one sent."""
 
     def take_book(self, book: TaskBook) -> None:
         """Continue with another book, made from the journal again."""
@@ -54,6 +56,7 @@ class HandGoals:
             is_other_floor: It has another grid: the goals are cells of the one before.
         """
         self._keeper.reset()
+        self._is_started_anew = is_same
         for entry in list(self._book.goals.values()):
             if is_other_floor:
                 self._end(entry, now, "the planner has another grid")
@@ -127,6 +130,9 @@ class HandGoals:
             now: Seconds since 1970.
         """
         book, facts = self._book, self._facts
+        if self._is_started_anew and facts.is_current:
+            self._is_started_anew = False
+            self._take_over_places(goals, now)
         for name, how in self._keeper.notice(facts, self.wanted(goals)).items():
             self._hold(name, how, now)
             known = book.goals.get(name)
@@ -145,6 +151,14 @@ class HandGoals:
             if known_robot is not None and entry.cell is not None:
                 known_robot.by_hand = not known_robot.is_at(entry.cell)
 
+    def _take_over_places(self, goals: Mapping[str, int | None], now: float) -> None:
+        """Take over robots that drive to a charger or parking place: the manager before sent them there."""
+        places = {*self._book.places.chargers, *self._book.places.parking}
+        for robot in self._facts.robots.values():
+            is_known = robot.id in goals or robot.id in self._book.goals
+            if robot.goal in places and not is_known and not robot.is_at(robot.goal):
+                self._keeper.assume(robot.id, robot.goal, now)
+
     def confirmed(self) -> list[GoalEntry]:
         """Return goals of requests that the planner has now, marked so."""
         if not self._facts.is_live or not self._facts.is_current:
@@ -155,6 +169,7 @@ class HandGoals:
             for entry in self._book.goals.values()
             if entry.unsent
             and entry.id not in self._asking
+            and not self._has_running_task(entry.id)  # the next step holds it, if it still sees the request
             and entry.id in robots
             and robots[entry.id].is_known
             and robots[entry.id].goal == entry.cell
@@ -179,6 +194,10 @@ class HandGoals:
             and needed.get(entry.cell, entry.id) != entry.id
         ):
             self._end(entry, now, f"cell {entry.cell} is the goal of {needed[entry.cell]}")
+
+    def _has_running_task(self, robot: str) -> bool:
+        task = self._book.task_of(robot)
+        return task is not None and task.state is TaskState.RUNNING
 
     def _hold(self, robot: str, how: str, now: float) -> None:
         task = self._book.task_of(robot)

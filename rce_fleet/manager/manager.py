@@ -177,6 +177,8 @@ class FleetManager:
         if self.facts.is_live:
             wanted = self.hand_goals.wanted(self.dispatcher.goals())
             for robot, cell in self.goals.to_send(self.facts, wanted, now):
+                if not self.goals.is_newest(robot, cell):
+                    continue
                 refusal = await self._planner.set_goal(robot, cell)
                 if refusal:
                     self.goals.refused(robot)

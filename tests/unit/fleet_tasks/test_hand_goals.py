@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import GoalEntry, PlannerRun, RobotEntry, Zone
+from rce_fleet.tasks.records import GoalEntry, Places, PlannerRun, RobotEntry, Zone
 from rce_fleet.tasks.task import TaskState
 
 RUN = PlannerRun("1.0", "8 x 8")
@@ -173,6 +173,59 @@ async def test_a_loaded_robot_goes_where_a_person_sends_it(fleet: Fleet) -> None
     for _ in range(3):
         await fleet.step()
     assert (fleet.robot().goal, fleet.task()) == (20, TaskState.HELD)
+
+
+async def test_a_stop_during_a_step_holds_the_task(fleet: Fleet) -> None:
+    """The planner has taken it over before the step comes to what was confirmed."""
+    await fleet.with_task()
+    parts = fleet.manager.dispatcher.parts
+
+    def stop_now(*given: Any) -> Iterator[None]:
+        entry = fleet.manager.hand_goals.request("Robot1", None, fleet.now, "anna")
+        with fleet.manager.hand_goals.asking(entry, fleet.now):
+            fleet.robot().goal, fleet.robot().state = None, "idle"
+        yield from parts(*given)
+
+    fleet.manager.dispatcher.parts = stop_now  # type: ignore[method-assign]
+    await fleet.step()
+    del fleet.manager.dispatcher.parts
+    await fleet.step()
+    assert (fleet.robot().goal, fleet.task()) == (None, TaskState.HELD)
+
+
+async def test_a_stop_counts_while_other_goals_are_sent(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for robot, cell in (("Robot1", 5), ("Robot2", 60)):
+        fleet.manager.book.create(Order((Stop(Action.GO, (cell,)),), robot=robot), fleet.now)
+    send = fleet.planner.set_goal
+
+    async def stop_the_other(robot: str, cell: int | None) -> str:
+        monkeypatch.setattr(fleet.planner, "set_goal", send)
+        other = "Robot2" if robot == "Robot1" else "Robot1"
+        assert await fleet.manager.set_goal(other, None, "anna") == ""
+        return await send(robot, cell)
+
+    monkeypatch.setattr(fleet.planner, "set_goal", stop_the_other)
+    for _ in range(3):
+        await fleet.step()
+    (stopped,) = [robot for robot, cell in fleet.planner.sent if cell is None]
+    assert [cell for robot, cell in fleet.planner.sent if robot == stopped] == [None]
+
+
+async def test_a_parking_robot_is_not_sent_by_another_program(fleet: Fleet) -> None:
+    """The manager that sent it there was killed."""
+    fleet.manager.book.emit(Places(parking=(20,)), "places", fleet.now)
+    await fleet.step()
+    await fleet.step()
+    sent = [robot for robot, cell in fleet.planner.sent if cell == 20]
+    assert len(sent) == 1
+    await fleet.manager.close()
+    fleet.start(RUN)
+    for _ in range(2):
+        await fleet.step()
+    assert fleet.manager.book.goals == {}
+    assert not fleet.robot(sent[0]).by_hand
 
 
 async def test_a_refused_goal_leaves_everything_as_it_was(fleet: Fleet) -> None:
