@@ -40,6 +40,7 @@ from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
 from rce_fleet.station.commands.manual_mode import ManualModes
 from rce_fleet.station.commands.owed_modes import OwedModes, modes_file
 from rce_fleet.station.commands.sources import CommandSource, EngineCommandSource, RosCommandSource
+from rce_fleet.station.commands.stop_modes import StopModes, stop_modes_file
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
@@ -53,6 +54,7 @@ from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.layers.sources import LayerSource
 from rce_fleet.station.masters_watch import DemoProcess, MastersWatch, masters_text
 from rce_fleet.station.planner_client import PlannerClient
+from rce_fleet.station.private_files import KeptInFile
 from rce_fleet.station.recording import Recorder, open_records
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
@@ -146,6 +148,7 @@ def ui(
                 webhooks=webhooks_file(place, backend.fleet),
                 stops=stops_file(place, backend.fleet),
                 modes=modes_file(place, backend.fleet),
+                stop_modes=stop_modes_file(place, backend.fleet),
                 kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
@@ -299,6 +302,7 @@ async def serve(
     webhooks: Path | None = None,
     stops: Path | None = None,
     modes: Path | None = None,
+    stop_modes: Path | None = None,
     kill_leader: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
@@ -318,14 +322,14 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     layers = LayerHub(backend.layers, view, TypeRegistry(PackageIndex.from_environ()))
     desired_stops = DesiredStops(stops)
-    control = RobotControl(
-        backend.commands,
-        view.robot_ids,
-        lambda: feed.on_control(
-            control.stopped, control.driven, control.fleet_stopped_by, control.undelivered
-        ),
-        desired_stops,
-    )
+
+    def tell_control() -> None:
+        feed.on_control(control.stopped, control.driven, control.fleet_stopped_by, control.undelivered)
+        modes_of_stops.wake()
+
+    control = RobotControl(backend.commands, view.robot_ids, tell_control, desired_stops)
+    owed_to_stopped = OwedModes(stop_modes)
+    modes_of_stops = StopModes(fleet, view, control, owed_to_stopped)
     types = TypeRegistry(PackageIndex.from_environ())
     link = (
         WorldLink(
@@ -364,14 +368,9 @@ async def serve(
     except OSError as error:
         typer.echo(f"rce ui: {error}", err=True)
         raise typer.Exit(1) from None
-    try:
-        await asyncio.to_thread(desired_stops.load)
-    except (OSError, ValueError) as error:
-        _log.error("emergency stops of before are not known: %s: %s", stops, error)
-    try:
-        await asyncio.to_thread(owed_modes.load)
-    except (OSError, ValueError) as error:
-        _log.error("robots that were driven by hand before are not known: %s: %s", modes, error)
+    await _load(desired_stops, stops, "emergency stops of before")
+    await _load(owed_modes, modes, "robots that were driven by hand before")
+    await _load(owed_to_stopped, stop_modes, "modes of robots before they were stopped")
     async with AsyncExitStack() as stack:
         stack.push_async_callback(layers.close)
         stack.push_async_callback(control.close)
@@ -393,6 +392,7 @@ async def serve(
             feed.run,
             lambda: backend.watch(feed.on_engine),
             control.run,
+            modes_of_stops.run,
             manual_modes.run,
             recorder.run,
             figures.run,
@@ -400,6 +400,14 @@ async def serve(
             *([masters.run] if masters else []),
             station.fleet_api.run,
         )
+
+
+async def _load(kept: KeptInFile[Any], file: Path | None, what: str) -> None:
+    """Read what an earlier station kept; without it this one begins anew."""
+    try:
+        await asyncio.to_thread(kept.load)
+    except (OSError, ValueError) as error:
+        _log.error("%s are not known: %s: %s", what, file, error)
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:
