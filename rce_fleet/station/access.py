@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
@@ -24,6 +25,7 @@ EMERGENCY_STOP = "/emergency-stop"
 """The end of paths of emergency stops."""
 STOP_CHECK_S = 0.3
 """How long an emergency stop waits for the check of its token."""
+_STOPS = re.compile(rf"{PREFIX}(/robots/[^/]+)?{EMERGENCY_STOP}")
 _PUBLIC = ("/login", f"{PREFIX}/login", f"{PREFIX}/openapi.json")
 """Paths that need no token, beside the static files of the pages."""
 MAX_TOKEN = 256
@@ -171,7 +173,7 @@ class AccessControl:
 
 def _is_stop(request: web.Request) -> bool:
     """Return whether a request stops robots, or releases them."""
-    return request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP)
+    return request.method == hdrs.METH_PUT and _STOPS.fullmatch(request.rel_url.raw_path) is not None
 
 
 def with_known_query(route: Route[Any], handler: Handler) -> Handler:

@@ -175,6 +175,8 @@ async def test_robots_are_stopped_while_the_master_is_away(way: str, monkeypatch
                 engine.answers.clear()
             else:
                 await engine.server.close()
+            zone = {"kind": "blocked", "cells": [1]}
+            assert (await made.put("/zones/emergency-stop", zone, "t"))[0] == 503  # it is not a stop
             assert (await made.put("/robots/Robot1/emergency-stop", stop, "t"))[0] == 200
             await made.until(lambda: made.stops[-1])
             status, text = await made.put("/robots/Robot1/emergency-stop", release, "t")
