@@ -124,6 +124,11 @@ class EventFeed:
         """
         return (await self._read(0, 1)).newest
 
+    @property
+    def oldest(self) -> int:
+        """The number of the oldest event that is kept here."""
+        return int(self._kept[0]["number"])
+
     async def after(self, number: int, *, ask: bool = False) -> Sequence[FleetEvent]:
         """Return the next events after a number, the oldest first; none if there is no newer one.
 
@@ -186,7 +191,7 @@ class EventCursor:
         if self.number is None:
             if not await feed.wait(None) or feed.newest is None:
                 return ()
-            self.number = feed.newest - 1
+            self.number = feed.oldest - 1  # several may have come together
         found = await self._after(self.number)
         if not found:
             found = await self._after(self.number, ask=not await feed.wait(self.number))

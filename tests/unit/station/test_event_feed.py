@@ -76,6 +76,16 @@ async def test_a_new_client_gets_events_from_now_on() -> None:
     assert numbers(await second.next()) == [5]
 
 
+async def test_a_new_client_gets_all_of_the_first_burst() -> None:
+    """Several come together, before the client has its turn."""
+    journal = Journal(5)
+    feed = EventFeed(journal.ask)
+    waiting = asyncio.create_task(EventCursor(feed, None).next())
+    await asyncio.sleep(0)
+    tell(feed, journal, 3, 4, 5)
+    assert numbers(await waiting) == [3, 4, 5]
+
+
 async def test_a_stream_begins_with_the_id_of_the_newest_event() -> None:
     """So that a client that loses it before the first event misses none."""
     journal = Journal(5)
