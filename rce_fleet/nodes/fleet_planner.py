@@ -204,7 +204,8 @@ class PlannerNode:
             self._handle(Tick())
             self._state.update(time.monotonic())
             self._poses.update(self._planner.state.robots, time.monotonic())
-            grids = self._robots.client_grids.values()
+            clients = self._robots.client_grids
+            grids = [clients[robot] for robot in self._planner.state.robots if robot in clients]
             self._grid.send_again(self._planner.state, self._state.started, grids)
 
     async def _make_plans(self, worker: PlanWorker) -> None:
@@ -247,10 +248,6 @@ class PlannerNode:
 
     def _refuse_grid(self, grid: GridMap) -> str:
         """Return why the fleet cannot change to a grid now; empty if it can."""
-        if self._planner.state.zones.lanes is not None:
-            return (
-                "the lanes are made for the present cells: change the file of lanes, and restart the planner"
-            )
         if self._takes_answers:
             return (
                 "the move clients have the grid from their parameters (answers): restart them and the planner"
