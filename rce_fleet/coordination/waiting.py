@@ -21,18 +21,22 @@ def find_deadlocks(state: FleetState) -> dict[str, str]:
         state: The fleet.
     """
     waits = _waits(state)
-    found: dict[str, str] = {}
-    for robot in sorted(waits):
-        chain = [robot]
-        while chain[-1] in waits and waits[chain[-1]] not in chain:
-            chain.append(waits[chain[-1]])
-        last = chain[-1]
-        if last in waits:
-            circle = chain[chain.index(waits[last]) :]
-            found[robot] = f"deadlock: {', '.join(sorted(circle))} wait for each other"
-        elif _rests(state, last):
-            found[robot] = f"deadlock: {last} rests on its path, in cell {state.ledger.route(last)[0]}"
-    return found
+    reasons: dict[str, str] = {}
+    for robot in waits:
+        chain: dict[str, None] = {}
+        last = robot
+        while last in waits and last not in chain and last not in reasons:
+            chain[last] = None
+            last = waits[last]
+        why = reasons.get(last, "")
+        if last in chain:
+            members = list(chain)
+            circle = members[members.index(last) :]
+            why = f"deadlock: {', '.join(sorted(circle))} wait for each other"
+        elif last not in waits and _rests(state, last):
+            why = f"deadlock: {last} rests on its path, in cell {state.ledger.route(last)[0]}"
+        reasons.update(dict.fromkeys(chain, why))
+    return {robot: reasons[robot] for robot in sorted(waits) if reasons[robot]}
 
 
 def _waits(state: FleetState) -> dict[str, str]:

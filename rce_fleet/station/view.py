@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from math import atan2, isfinite
+from math import isfinite
 from typing import Any
+
+from rce_fleet.geometry.angles import yaw_of
 
 ROBOT_RADIUS = 0.22
 """Radius of the robots as the page draws them, metres."""
@@ -26,7 +28,7 @@ class Pose:
         """Read a geometry_msgs/PoseWithCovarianceStamped in its JSON form."""
         pose = message["pose"]["pose"]
         position, turn = pose["position"], pose["orientation"]
-        return cls(position["x"], position["y"], yaw_of(turn))
+        return cls(position["x"], position["y"], yaw_of(*(turn[axis] for axis in "xyzw")))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,8 @@ class FleetView:
 
     def on_grid(self, message: dict[str, Any]) -> ViewChange:
         """Set the grid's rotation from a ``nav_msgs/OccupancyGrid`` of ``/fleet/map``."""
-        yaw = yaw_of(message["info"]["origin"]["orientation"])
+        turn = message["info"]["origin"]["orientation"]
+        yaw = yaw_of(*(turn[axis] for axis in "xyzw"))
         if yaw == self._yaw or not isfinite(yaw):
             return _NOTHING
         self._yaw = yaw
@@ -237,11 +240,3 @@ def _ascending(cells: set[int]) -> tuple[int, ...]:
 
 def _cell(number: int) -> int | None:
     return None if number < 0 else number
-
-
-def yaw_of(turn: dict[str, float]) -> float:
-    """Return the yaw of a ``geometry_msgs/Quaternion`` in its JSON form, radians."""
-    return atan2(
-        2.0 * (turn["w"] * turn["z"] + turn["x"] * turn["y"]),
-        1.0 - 2.0 * (turn["y"] ** 2 + turn["z"] ** 2),
-    )

@@ -20,9 +20,9 @@ from rce.ros.errors import RosError
 from rce.ros.node import Node
 from rce.web.bodies import read_whole
 from rce.web.routes import Route, RouteTable
+from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.station.access import AccessControl, problem
 from rce_fleet.station.api import Answer
-from rce_fleet.station.view import yaw_of
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, TypeRegistry
@@ -132,7 +132,7 @@ class WorldLink:
                     name,
                     round(pose.position.x, 3),
                     round(pose.position.y, 3),
-                    round(yaw_of({axis: getattr(pose.orientation, axis) for axis in "xyzw"}), 3),
+                    round(yaw_of(*(getattr(pose.orientation, axis) for axis in "xyzw")), 3),
                 ]
                 for name, pose in zip(message.name, message.pose, strict=True)
             ]
