@@ -27,7 +27,7 @@ REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_TIMEOUT_S = 3.0
 RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
 """Environment variable for :mod:`support.roscpp_programs`: the folder of what all workers of a run share."""
-WORKERS_PER_CORE = 2.5
+WORKERS_PER_CORE = 3
 WORKERS_PER_THREAD = 2
 """Of a core with several threads, which share its time."""
 
