@@ -180,11 +180,11 @@ async def test_a_stop_during_a_step_holds_the_task(fleet: Fleet) -> None:
     await fleet.with_task()
     parts = fleet.manager.dispatcher.parts
 
-    def stop_now(*given: Any) -> Iterator[None]:
+    def stop_now(now: float, facts: FleetFacts) -> Iterator[None]:
         entry = fleet.manager.hand_goals.request("Robot1", None, fleet.now, "anna")
         with fleet.manager.hand_goals.asking(entry, fleet.now):
             fleet.robot().goal, fleet.robot().state = None, "idle"
-        yield from parts(*given)
+        yield from parts(now, facts)
 
     fleet.manager.dispatcher.parts = stop_now  # type: ignore[method-assign]
     await fleet.step()
