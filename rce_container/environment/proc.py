@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import sys
 import time
@@ -109,6 +110,13 @@ def alive(pid: int, start: int) -> bool:
     """Return whether the process with this pid and start time still runs."""
     process = read(pid)
     return process is not None and process.start == start
+
+
+def has_ended(pidfd: int) -> bool:
+    """Return whether the process of a pidfd has ended."""
+    poll = select.poll()  # select() refuses descriptors from 1024
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def proportional(pid: int) -> int | None:

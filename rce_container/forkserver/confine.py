@@ -11,9 +11,9 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
-import select
 from pathlib import Path
 
+from rce_container.environment import proc
 from rce_container.environment.process import set_rlimits
 from rce_container.forkserver import kernel, mounts
 from rce_container.forkserver.kernel import Namespaces
@@ -101,7 +101,7 @@ def _pid_of(pidfd: int) -> int:
 
 def _check_alive(pidfd: int) -> None:
     """Verify that what was found by a pid belongs to the process and not to a later one."""
-    if select.select((pidfd,), (), (), 0)[0]:
+    if proc.has_ended(pidfd):
         raise ProcessLookupError("the holder of the namespaces is gone")
 
 

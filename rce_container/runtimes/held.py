@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import socket
 import subprocess
 from collections.abc import Sequence
@@ -110,10 +109,12 @@ class HeldHandle(Handle):
             holder = os.pidfd_open(pid)
         except OSError as error:
             raise StartError(f"the holder of its namespaces cannot be used: {error}") from error
-        descends = _descends(pid, self.process.pid)
-        if select.select((holder,), (), (), 0)[0] or not descends:
-            os.close(holder)
-            raise StartError("the holder of its namespaces died")
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.close, holder)
+            # In this order: what was read of the pid is of this process if it still runs.
+            if not _descends(pid, self.process.pid) or proc.has_ended(holder):
+                raise StartError("the holder of its namespaces died")
+            undo.pop_all()
         return holder
 
     def _close(self) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,21 @@ async def namespaces(folder: Path) -> AsyncIterator[Machine]:
     machine = Machine(folder, "namespace")
     yield machine
     machine.tidy()
+
+
+@pytest.fixture
+def many_descriptors() -> Iterator[None]:
+    """More open descriptors than select() can wait for."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = 4096
+    if hard < needed:
+        pytest.skip(f"a process may open only {hard} files here")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, needed), hard))
+    fds = [os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC) for _ in range(1100)]
+    yield
+    for fd in fds:
+        os.close(fd)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def fork_server(machine: Machine) -> int:
@@ -67,6 +83,13 @@ async def test_a_container_that_lost_a_part_is_made_again(namespaces: Machine, v
         await until(lambda: machine.reported(BOX).incarnation not in ("", first.incarnation))
         assert [pid for pid, start in machine.pids.items() if proc.alive(pid, start)] == []
         await machine.node_is(BOX, "echo", NodeState.RUNNING)
+
+
+@pytest.mark.usefixtures("many_descriptors")
+async def test_a_container_starts_beside_many_descriptors(namespaces: Machine) -> None:
+    async with namespaces.engine():
+        await running(namespaces)
+        assert namespaces.faults == []
 
 
 async def test_containers_do_not_need_the_fork_server(namespaces: Machine) -> None:
