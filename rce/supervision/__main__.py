@@ -60,11 +60,13 @@ def _certificates(plan: Plan) -> AbstractAsyncContextManager[None]:
 
 
 def _say(line: str) -> None:
-    print(line, flush=True)  # noqa: T201 - the programs' output
+    with contextlib.suppress(OSError):  # a full disk or a closed pipe must not end the programs
+        print(line, flush=True)  # noqa: T201 - the programs' output
 
 
 def _complain(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)  # noqa: T201 - for the caller
+    with contextlib.suppress(OSError):  # as above
+        print(line, file=sys.stderr, flush=True)  # noqa: T201 - for the caller
 
 
 def main() -> int:

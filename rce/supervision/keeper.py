@@ -9,6 +9,7 @@ started by the next request, and has an owner that knows its protocol: converter
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -40,7 +41,7 @@ class Keeper:
 
     Args:
         begin: Starts a process of the program; raises :class:`OSError` if that is not possible.
-        take_line: Gets every line that it prints.
+        take_line: Gets every line that it prints. A line is lost if this raises :class:`OSError`.
         policy: When it is started again.
 
     Attributes:
@@ -71,7 +72,7 @@ class Keeper:
         return self.child
 
     async def run(self, on_end: Callable[[int, float | None], bool]) -> int:
-        """Keep the program running.
+        """Keep the program running. An error of a later start counts as one more end.
 
         A process that :meth:`start` started is the first one. The end of this call, also by cancellation or
         an error of ``on_end``, ends the process.
@@ -84,25 +85,19 @@ class Keeper:
             The exit code of the last process.
 
         Raises:
-            OSError: It cannot be started.
+            OSError: Its first process cannot be started.
         """
         loop = asyncio.get_running_loop()
-        child = self.child or await self.start()
-        while True:
+        child: Child | None = self.child or await self.start()
+        code = 0
+        while child is not None:
             started = loop.time()
             code = await self._run_once(child)
             if self._stopping.is_set():
-                return code
+                break
             pause = self._next_pause(loop.time() - started)
-            if not on_end(code, pause) or pause is None:
-                return code
-            try:
-                async with asyncio.timeout(pause):
-                    await self._stopping.wait()
-            except TimeoutError:
-                child = await self.start()
-            else:
-                return code
+            child = await self._start_again(pause) if on_end(code, pause) else None
+        return code
 
     async def stop(self, *, timeout: float) -> None:
         """End the program, and do not start it again. :meth:`run` then returns.
@@ -120,6 +115,21 @@ class Keeper:
             return None
         return self._policy.backoff.pause_after(self._ends)
 
+    async def _start_again(self, pause: float | None) -> Child | None:
+        """Start a process after a pause; return None if it is stopped or has failed too often."""
+        while pause is not None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._stopping.wait()
+            if self._stopping.is_set():
+                break
+            try:
+                return await self.start()
+            except OSError as error:  # memory or processes are exhausted for a while
+                self._show(f"(it cannot be started: {error})")
+                pause = self._next_pause(0.0)
+        return None
+
     async def _run_once(self, child: Child) -> int:
         reading = asyncio.create_task(self._read(child))
         try:
@@ -133,4 +143,8 @@ class Keeper:
 
     async def _read(self, child: Child) -> None:
         async for line in child.lines():
+            self._show(line)
+
+    def _show(self, line: str) -> None:
+        with contextlib.suppress(OSError):  # a full disk: the program would block with its output not read
             self._take_line(line)

@@ -79,8 +79,8 @@ class Program:
         """Add a line that it printed."""
         self.tail.append(line)
         self._lines.append(line)
+        self._printed.set()  # also if the line cannot be shown
         self._show(line)
-        self._printed.set()
 
     async def wait_line(self, start: str) -> str:
         """Wait for a line that begins with ``start``; return the rest of the line."""
@@ -218,7 +218,7 @@ class ProgramGroup:
         with log:
             try:
                 code = await program.keeper.run(on_end)
-            except OSError as error:  # it cannot be restarted
+            except OSError as error:  # a restart cannot be reported
                 program.add_line(str(error))
                 code = program.child.returncode or 0
         if not (program.is_done or self._stopping.done() or self._failure.done()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import sys
@@ -45,6 +46,15 @@ async def test_lines_are_logged_shown_and_waited_for(tmp_path: Path) -> None:
     assert shown == ["[talker] talker ready: 42"]
     assert (tmp_path / "talker.log").read_text() == "talker ready: 42\n"
     assert talker.child.returncode == -signal.SIGTERM
+
+
+async def test_lines_that_cannot_be_shown_are_waited_for(tmp_path: Path) -> None:
+    def refuse(_: str) -> None:
+        raise OSError(errno.EPIPE, "the terminal is closed")
+
+    async with ProgramGroup(tmp_path, refuse) as group:
+        talker = await group.start("talker", python(TALKER))
+        assert await group.wait_line(talker, "talker ready:", 60) == "42"
 
 
 async def test_programs_are_stopped_if_a_signal_comes_while_they_stop(tmp_path: Path) -> None:

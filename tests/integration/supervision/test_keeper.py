@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import signal
 import sys
 
@@ -52,6 +53,38 @@ async def test_a_program_that_ran_long_counts_as_new() -> None:
     policy = RestartPolicy(AT_ONCE, stable_s=0.0, max_ends=2)
     assert await keeper("", [], policy).run(on_end) == 0
     assert count == 5
+
+
+async def test_a_line_that_cannot_be_taken_is_lost() -> None:
+    """The next ones are read: a program whose output is not read blocks in its next write."""
+
+    def refuse(line: str) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    code = "for _ in range(50_000): print('x' * 99)"
+    kept = Keeper(lambda: Child.start("p", [sys.executable, "-c", code]), refuse, ENDLESS)
+    async with asyncio.timeout(60):
+        assert await kept.run(lambda code, pause: False) == 0
+
+
+@pytest.mark.parametrize("failures", [2, 9])
+async def test_a_failed_restart_counts_as_an_end(failures: int) -> None:
+    """It is tried again while the policy allows it."""
+    starts = 0
+    lines: list[str] = []
+
+    async def begin() -> Child:
+        nonlocal starts
+        starts += 1
+        if 1 < starts <= 1 + failures:
+            raise OSError(errno.EAGAIN, "too many processes")
+        return await Child.start("p", [sys.executable, "-c", f"raise SystemExit({starts})"])
+
+    policy = RestartPolicy(AT_ONCE, stable_s=1000.0, max_ends=4)
+    code = await Keeper(begin, lines.append, policy).run(lambda code, pause: True)
+    assert (code, starts) == ((4, 4) if failures == 2 else (1, 4))
+    assert all("cannot be started" in line and "too many processes" in line for line in lines)
+    assert len(lines) == starts - (2 if failures == 2 else 1)
 
 
 async def test_the_owner_decides_whether_it_is_started_again() -> None:

@@ -109,6 +109,36 @@ asyncio.run(main())
     await supervisor.stop()
 
 
+async def test_output_that_cannot_be_shown_is_lost(tmp_path: Path) -> None:
+    """On a full disk the programs print on, and it is seen that they are ready."""
+    printed, second = tmp_path / "printed", tmp_path / "second"
+    flood = (
+        "import pathlib, time; print('x ready: y', flush=True)\n"
+        "for _ in range(50_000): print('x' * 99)\n"
+        f"pathlib.Path({str(printed)!r}).touch(); time.sleep(1000)"
+    )
+    after = f"import pathlib; pathlib.Path({str(second)!r}).touch(); {READY}"
+    programs = [("a", [sys.executable, "-c", flood]), ("b", [sys.executable, "-c", after])]
+    code = f"""
+import asyncio
+from rce.supervision.__main__ import run
+from rce.supervision.plan import Plan, Program
+programs = tuple(Program(*words) for words in {programs!r})
+asyncio.run(run(Plan(programs=programs, ready=("all",)), {{}}))
+"""
+    with Path("/dev/full").open("w") as full:
+        supervisor = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stdout=full)
+    try:
+        async with asyncio.timeout(60):
+            while not (printed.exists() and second.exists()):
+                assert supervisor.returncode is None
+                await asyncio.sleep(0.02)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            supervisor.terminate()
+        await supervisor.wait()
+
+
 async def test_what_a_killed_program_leaves_is_removed_at_the_end(tmp_path: Path) -> None:
     note, killed = tmp_path / "note", asyncio.Event()
 
