@@ -115,7 +115,8 @@ class CgroupControlGroup(ControlGroup):
 
     def _strike(self, pids: Iterable[int]) -> None:
         if self._has("cgroup.kill"):
-            self._write("cgroup.kill", 1)
+            with contextlib.suppress(OSError):  # it is removed when its last process has ended
+                self._write("cgroup.kill", 1)
             return
         with contextlib.suppress(OSError):
             self._write("pids.max", 0)

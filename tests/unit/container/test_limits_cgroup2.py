@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
+import shutil
 from pathlib import Path
 
 import pytest
 from support.cgroup_trees import Tree2
 
 from rce_container.exceptions import LimitError, LimitsUnavailableError
-from rce_container.limits import Limits, choose_limiter
+from rce_container.limits import Limits, choose_limiter, files
 from rce_container.limits.base import Troubles
 from rce_container.limits.cgroup2 import Cgroup2, ControlGroupV2
 
@@ -73,6 +75,22 @@ def test_a_program_that_made_room_before_works_beside_it(
     tree = Tree2(tmp_path, monkeypatch, controllers=ALL, own="system.slice/rce.service/rce-engine")
     control_group = limiter(tree).create("m1", LIMITS)
     assert control_group.join == (str(tree.own.parent / "rce-t0" / "m1" / "cgroup.procs"),)
+
+
+def test_a_cgroup_that_vanishes_as_it_is_killed_is_empty(
+    tree: Tree2, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control_group = limiter(tree).create("m1", LIMITS)
+    folder = tree.own / "rce-t0" / "m1"
+    (folder / "cgroup.procs").write_text("4194305\n")
+
+    def vanish(path: Path, _: int | str) -> None:
+        shutil.rmtree(folder)
+        raise OSError(errno.ENODEV, "No such device", str(path))
+
+    monkeypatch.setattr(files, "write", vanish)
+    control_group.kill()
+    assert not folder.exists()
 
 
 def test_usage_and_troubles_are_read(tree: Tree2) -> None:
