@@ -103,7 +103,8 @@ class Turns:
             raise CrowdedError
         turn = members[loser][-1]
         self._forget(largest, loser, turn)
-        turn.set_exception(CrowdedError())
+        if not turn.done():  # it may just have been cancelled
+            turn.set_exception(CrowdedError())
 
     def _forget(self, crowd: str, member: str, turn: asyncio.Future[None]) -> None:
         members = self._crowds.get(crowd, OrderedDict())

@@ -93,6 +93,24 @@ async def test_member_with_most_makes_room_within_its_crowd() -> None:
     assert site.begun == ["x0", "x1", "y0", "x2"]
 
 
+async def test_a_waiter_that_was_just_cancelled_makes_room() -> None:
+    turns, end = Turns(1, waiting=1), asyncio.Event()
+
+    async def work() -> None:
+        async with turns.turn("a"):
+            await end.wait()
+
+    working, waiting = asyncio.create_task(work()), asyncio.create_task(work())
+    await asyncio.sleep(0)
+    waiting.cancel()
+    end.set()
+    async with turns.turn("b"):
+        assert working.done()
+    await asyncio.gather(working, waiting, return_exceptions=True)
+    assert waiting.cancelled()
+    assert (turns.working, turns.waiting) == (0, 0)
+
+
 async def test_a_crowd_has_no_more_at_work_than_it_may() -> None:
     async with asyncio.TaskGroup() as group:
         site = Site(Turns(3, waiting=100, each=1), group)
