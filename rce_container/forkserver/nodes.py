@@ -29,7 +29,7 @@ _PAUSE_S = 0.0002
 
 
 class Script(Struct, frozen=True, kw_only=True):
-    """A request to start a node. Answered by its pid."""
+    """A request to start a node. Answered by its pid, just before it begins."""
 
     path: str
     arguments: tuple[str, ...]
@@ -59,14 +59,19 @@ def serve(orders: socket.socket) -> None:
 
 
 def _leave_to_environment(orders: socket.socket) -> None:
-    """Continue as a child whose parent ends at once: the environment adopts orphans."""
+    """Continue as a child whose parent ends at once: the environment adopts orphans, and gets its pid.
+
+    Ends if the environment does not wait for it any more, since it starts the node in the ordinary way then.
+    """
     between = os.getpid()
-    child = os.fork()
-    if child:
-        orders.send(b"%d" % child)
+    if os.fork():
         os._exit(0)
     while os.getppid() == between:  # a node may ask to end with its parent
         time.sleep(_PAUSE_S)
+    try:
+        orders.send(b"%d" % os.getpid())
+    except OSError:
+        os._exit(1)
 
 
 def _be(script: Script, fds: list[int]) -> None:

@@ -47,7 +47,8 @@ class NodeForkServer:
             _log.warning(
                 "nodes start more slowly from now on: the node fork server does not answer: %s", error
             )
-            answer = b""
+            answer = _last_answer(self._sock)
+            self.close()
         if not answer:
             self.close()
             return 0
@@ -58,6 +59,16 @@ class NodeForkServer:
         if self._sock is not None:
             self._sock.close()
             self._sock = None
+
+
+def _last_answer(sock: socket.socket) -> bytes:
+    """Refuse all answers from now on; return one that has come before, since its process runs."""
+    try:
+        sock.setblocking(False)
+        sock.shutdown(socket.SHUT_RD)
+        return sock.recv(_MAX_ANSWER)
+    except OSError:
+        return b""
 
 
 def fits(argv: Sequence[str], env: Mapping[str, str], own: Mapping[str, str]) -> bool:
