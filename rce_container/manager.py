@@ -392,10 +392,9 @@ class Manager:
             ContainerError,
             OSError,
         ) as error:  # disk, descriptors or memory are exhausted
-            self._spawn(self._undo(folder.incarnation_id), name=f"what was made of {id_}")
+            self._spawn(self._undo(id_, folder.incarnation_id, str(error)), name=f"what was made of {id_}")
             folder.remove()
             self._state.archive.end(id_, folder.incarnation_id, f"cannot be started: {error}", time.time())
-            self._feed(events.Lost(id_, "", str(error)))
             return
         incarnation = self._own(id_, folder, handle, control_group, isolated=isolated)
         self._starting.add(incarnation)
@@ -409,9 +408,11 @@ class Manager:
         if self._snapshots is not None:
             await self._snapshots.run(self._incarnations)
 
-    async def _undo(self, incarnation_id: str) -> None:
+    async def _undo(self, id_: str, incarnation_id: str, error: str) -> None:
+        """Remove what was made of a container that cannot be started; only then it is tried again."""
         await self._launcher.undo(incarnation_id)
         self._keeper.release(incarnation_id)
+        self._feed(events.Lost(id_, "", error))
 
     async def _await_start(self, incarnation: Incarnation) -> None:
         with contextlib.suppress(TimeoutError):  # its volumes are being enlarged; others need not wait for it
