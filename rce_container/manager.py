@@ -7,7 +7,6 @@ import contextlib
 import logging
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from typing import TYPE_CHECKING, assert_never
 
@@ -69,6 +68,7 @@ from rce_container.node_states import StateCarrier
 from rce_container.packages.supply import Library
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle, Runtime
+from rce_container.start_queue import StartQueue
 from rce_container.usage import Subject, UsageMeter
 from rce_container.volumes.keeper import VolumeKeeper
 from rce_container.volumes.snapshots import FetchPiece, SnapshotKeeper
@@ -174,8 +174,7 @@ class Manager:
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._incarnations: dict[str, Incarnation] = {}
         """All incarnations that may have processes or folders, by id."""
-        self._queue: deque[str] = deque()
-        """Containers that wait to be started until fewer are starting."""
+        self._queue = StartQueue()
         self._starting: set[Incarnation] = set()
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
@@ -298,7 +297,8 @@ class Manager:
                 await asyncio.gather(*(one.save_states() for one in self._incarnations.values()))
                 self._feed(events.Quit())
                 self._start_waiting()
-                if self._incarnations:
+                while self._incarnations:
+                    self._empty.clear()
                     await self._empty.wait()
                 usage.cancel()
                 pruning.cancel()
@@ -347,7 +347,7 @@ class Manager:
             case events.Tell(message=message):
                 self._tell(message)
             case events.Start(id=id_):
-                self._queue.append(id_)
+                self._queue.put(id_)
                 self._start_waiting()
             case events.Apply(incarnation_id=incarnation_id, spec=spec):
                 self._incarnations[incarnation_id].apply(spec)
@@ -368,15 +368,15 @@ class Manager:
 
     def _start_waiting(self) -> None:
         """Start waiting containers within the limit, and drop those not desired any more."""
-        waiting, self._queue = self._queue, deque()
-        for id_ in waiting:
-            container = self._core.containers.get(id_)
-            if container is None or container.phase is not Phase.STARTING:
-                self._feed(events.Lost(id_, "", "it is not wanted any more"))
-            elif len(self._starting) < self._settings.starts_at_once:
-                self._start(id_)
-            else:
-                self._queue.append(id_)
+        for id_ in self._queue.discard(self._is_unwanted):
+            self._feed(events.Lost(id_, "", "it is not wanted any more"))
+        most = self._settings.starts_at_once
+        while len(self._starting) < most and (id_ := self._queue.take(one.id for one in self._starting)):
+            self._start(id_)
+
+    def _is_unwanted(self, id_: str) -> bool:
+        container = self._core.containers.get(id_)
+        return container is None or container.phase is not Phase.STARTING
 
     def _start(self, id_: str) -> None:
         try:
@@ -388,10 +388,7 @@ class Manager:
             handle, control_group, isolated = self._launcher.launch(
                 id_, folder, self._core.resources(id_), self._core.placements(id_)
             )
-        except (
-            ContainerError,
-            OSError,
-        ) as error:  # disk, descriptors or memory are exhausted
+        except (ContainerError, OSError) as error:  # disk, descriptors or memory are exhausted
             self._spawn(self._undo(id_, folder.incarnation_id, str(error)), name=f"what was made of {id_}")
             folder.remove()
             self._state.archive.end(id_, folder.incarnation_id, f"cannot be started: {error}", time.time())

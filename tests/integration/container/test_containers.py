@@ -15,6 +15,7 @@ from support.container_peers import Peer, joined
 from support.container_specs import ECHO, ECHO_INTERFACES, MACHINE
 from support.containers import Machine, is_in, until
 
+from rce.control.messages import Status
 from rce.control.model import EndpointState, LinkAddress, NodeState
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce.ros.types import TypeRegistry
@@ -303,6 +304,18 @@ async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None
             await until(partial(is_in, machine, box, EndpointState.RUNNING), what=f"{box} is running")
         assert len(machine.shims()) == 2, "a container was made that was dropped before its turn came"
         assert machine.faults == []
+
+
+async def test_users_take_turns_at_starts(machine: Machine) -> None:
+    async with machine.engine(starts_at_once=1):
+        boxes = ["user/box0", "user/box1", "user/box2", "other/box"]
+        for box in boxes:
+            await machine.put(box)
+        for box in boxes:
+            await until(partial(is_in, machine, box, EndpointState.RUNNING), what=f"{box} is running")
+        told = [message.status for message in machine.of(Status)]
+        order = list(dict.fromkeys(status.id for status in told if status.incarnation))
+        assert order == ["user/box0", "other/box", "user/box1", "user/box2"]
 
 
 async def test_a_manager_that_quits_starts_nothing_any_more(machine: Machine) -> None:
