@@ -60,6 +60,8 @@ _log = logging.getLogger(__name__)
 
 _SHIM_TIMEOUT_S = 5.0
 """Seconds that the shim has to remove the folders of a container that ended properly."""
+_GIVE_TIMEOUT_S = 3600.0
+"""Seconds in which the files of volumes are given to a container's user, within its share of a processor."""
 _LAST_OUTPUT_LENGTH = 300
 
 
@@ -117,6 +119,8 @@ class Incarnation:
         self._desired: DesiredState | None = None
         self._deadline: asyncio.Timeout | None = None
         self._features: frozenset[str] = frozenset()
+        self._gives_files = False
+        """Whether its environment is being made and is giving the files of volumes to its user."""
         self._stopping = False
         self._stop_reason = ""
         self._kill_now = False
@@ -247,6 +251,7 @@ class Incarnation:
         self._stop_reason = reason or self._stop_reason
         if self._channel is not None:
             self._channel.send(m.encode(m.Stop()))
+        if self._channel is not None or self._gives_files:
             self._limit(self._context.settings.stop_timeout)
 
     def stop_over_limit(self, text: str) -> None:
@@ -317,6 +322,9 @@ class Incarnation:
         handle = self.handle
         before = handle.environment
         await handle.launch(self._prepare)
+        if self._gives_files:
+            self._gives_files = False
+            self._limit(self._context.settings.start_timeout)
         record = self.folder.read_record()
         if handle.environment is before or handle.environment is None or record is None:
             return
@@ -334,7 +342,8 @@ class Incarnation:
         if self._context.volumes.claims(self.incarnation_id):
             self._limit(None)  # an interrupted change of a file system's size destroys it
             await in_own_thread(self._context.volumes.prepare, self.incarnation_id)
-            self._limit(self._context.settings.start_timeout)
+            self._gives_files = True
+            self._limit(self._context.settings.stop_timeout if self._stopping else _GIVE_TIMEOUT_S)
 
     async def _hang_up(self) -> None:
         self._deadline = None

@@ -22,6 +22,7 @@ from rce.control.messages import RemoveVolume, VolumeLimit, VolumeRemoved
 from rce.control.model import EndpointState
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
 from rce_container.exceptions import VolumeError
+from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.volumes import images
 from rce_container.volumes.places import VolumePlaces
 from rce_container.volumes.store import VolumeStore
@@ -260,6 +261,49 @@ async def test_enlarging_may_take_longer_than_a_start(sandbox: Machine, held_pre
         assert sandbox.faults == []
         assert held_prepare.claimed == [True]
         await sandbox.drop(BOX)
+
+
+@pytest.fixture
+def held_fork_server(sandbox: Machine) -> Iterator[Callable[[], None]]:
+    """Environments are not made, as if a volume had very many files, until the test calls this."""
+    assert isinstance(sandbox.runtime, NamespaceRuntime)
+    sandbox.volume_limit = VolumeLimit.IMAGE
+    fork_server = sandbox.runtime._fork_server
+    fork_server.start()
+    os.kill(fork_server.pid, signal.SIGSTOP)
+
+    def go_on() -> None:
+        os.kill(fork_server.pid, signal.SIGCONT)
+
+    yield go_on
+    go_on()
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_giving_files_may_take_longer_than_a_start(
+    sandbox: Machine, held_fork_server: Callable[[], None]
+) -> None:
+    """Each file of a volume is given to the user of the container, within its share of a processor."""
+    async with sandbox.engine(start_timeout=5.0):
+        await put(sandbox, "keep.py")
+        asyncio.get_running_loop().call_later(6.0, held_fork_server)
+        await sandbox.log_holds(BOX, "node", "1 runs")
+        assert sandbox.faults == []
+        await sandbox.drop(BOX)
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_a_container_that_gives_files_can_be_dropped(
+    sandbox: Machine, held_fork_server: Callable[[], None]
+) -> None:
+    async with sandbox.engine(interrupt_timeout=0.1, terminate_timeout=0.1, cleanup_timeout=0.1):
+        await put(sandbox, "keep.py")
+        (incarnation,) = sandbox.manager._incarnations.values()
+        await until(lambda: incarnation._gives_files, what="its volume is prepared")
+        await sandbox.drop(BOX)
+        held_fork_server()
 
 
 @pytest.mark.needs("bwrap")
