@@ -125,6 +125,7 @@ class Incarnation:
         self._stop_reason = ""
         self._kill_now = False
         self._background = BackgroundTasks()
+        self._dials = BackgroundTasks()
         self._node_states = ContainerStates(id, folder.incarnation_id, context.node_states)
         self._supply = Supply(
             self.incarnation_id,
@@ -349,6 +350,7 @@ class Incarnation:
         self._deadline = None
         self._handles_links = False
         await self._background.close()
+        await self._dials.close()
         await self._supply.close()
         await self._node_states.close()
         if self._channel is not None:
@@ -363,6 +365,7 @@ class Incarnation:
             self._handle_message(channel, intake.read(line), pace)
             if pause := pace.pause:
                 await asyncio.sleep(pause)
+            await channel.drain(intake.MAX_UNREAD)
 
     def _handle_message(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
         match said:
@@ -385,7 +388,7 @@ class Incarnation:
             case m.StateWanted() | m.StateOffered() | m.StateSaved():
                 self._node_states.handle(channel, said)
             case m.Dial() as request:
-                self._background.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+                self._begin_dial(channel, request)
             case Unknown(name=name):
                 _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
             case message:
@@ -439,6 +442,13 @@ class Incarnation:
         self._handles_links = True
         with self._links.open() as theirs:
             channel.send(m.encode(m.Handover(features=(PATCHES, NODE_STATES))), theirs.fileno())
+
+    def _begin_dial(self, channel: Channel, request: m.Dial) -> None:
+        if len(self._dials) < intake.MAX_DIALS:
+            self._dials.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+        else:
+            error = f"the container has {intake.MAX_DIALS} connections under way already"
+            channel.send(m.encode(m.Dialed(request=request.request, error=error)))
 
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
         links = self._desired.links.values() if self._desired is not None else ()

@@ -64,6 +64,10 @@ PER_PART = 500
 PER_LOOK = 100_000
 """The same for a line that makes the manager search for processes."""
 
+MAX_UNREAD = 64
+"""Lines that may wait for an environment to read them; while there are more, its own are not read."""
+MAX_DIALS = 256
+"""Connections to peers that may be under way for one container."""
 PER_STATE = 200_000
 """The cost of a snapshot of a node's state in addition to its bytes, in a count of its own."""
 

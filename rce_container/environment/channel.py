@@ -15,6 +15,8 @@ MAX_LINE = 16 << 20
 """Bytes; a container's whole specification is one line."""
 MAX_UNSENT = 64 << 20
 """Bytes that may wait for a peer that does not read."""
+MAX_UNSENT_FDS = 512
+"""Descriptors that may wait for it."""
 _CHUNK = 1 << 16
 _MAX_FDS = 16
 
@@ -40,6 +42,8 @@ class Channel:
         self._fds: deque[int] = deque()
         self._unsent: deque[tuple[memoryview, int | None]] = deque()
         self._unsent_bytes = 0
+        self._unsent_fds = 0
+        self._draining: asyncio.Future[None] | None = None
         self._closed = False
         self._waiting: asyncio.Future[None] | None = None
 
@@ -75,19 +79,30 @@ class Channel:
     def send(self, line: bytes, fd: int | None = None) -> None:
         """Send a line, and a duplicate of ``fd`` with it. Never blocks; does nothing on a closed channel.
 
-        The channel closes if its peer leaves more than :data:`MAX_UNSENT` bytes unread.
+        The channel closes if its peer leaves more than :data:`MAX_UNSENT` bytes, or :data:`MAX_UNSENT_FDS`
+        descriptors, unread.
         """
         if self._closed:
             return
         idle = not self._unsent
         self._unsent.append((memoryview(line + b"\n"), None if fd is None else os.dup(fd)))
         self._unsent_bytes += len(line) + 1
-        if self._unsent_bytes > MAX_UNSENT:
+        self._unsent_fds += fd is not None
+        if self._unsent_bytes > MAX_UNSENT or self._unsent_fds > MAX_UNSENT_FDS:
             self.close()
         elif idle:
             self._flush()
             if self._unsent:
                 self._loop.add_writer(self._sock, self._flush)
+
+    async def drain(self, most: int) -> None:
+        """Wait until no more than ``most`` lines wait for the peer to read, or the channel is closed.
+
+        Only one task may wait at a time.
+        """
+        while len(self._unsent) > most and not self._closed:
+            self._draining = self._loop.create_future()
+            await self._draining
 
     def close(self) -> None:
         """Close the connection and all descriptors that were not taken or not sent."""
@@ -101,8 +116,8 @@ class Channel:
             os.close(fd)
         self._fds.clear()
         self._unsent.clear()
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(None)
+        _wake(self._waiting)
+        _wake(self._draining)
 
     def _flush(self) -> None:
         while self._unsent and not self._closed:
@@ -116,9 +131,11 @@ class Channel:
                 return
             if fd is not None:
                 os.close(fd)
+                self._unsent_fds -= 1
             self._unsent_bytes -= sent
             if sent == len(data):
                 self._unsent.popleft()
+                _wake(self._draining)
             else:
                 self._unsent[0] = (data[sent:], None)
         if not self._closed:
@@ -158,8 +175,8 @@ class Channel:
                 self._loop.remove_reader(self._sock)
 
 
-def _wake(waiting: asyncio.Future[None]) -> None:
-    if not waiting.done():
+def _wake(waiting: asyncio.Future[None] | None) -> None:
+    if waiting is not None and not waiting.done():
         waiting.set_result(None)
 
 

@@ -75,6 +75,44 @@ async def test_a_peer_that_does_not_read_is_given_up(monkeypatch: pytest.MonkeyP
     other.close()
 
 
+async def test_descriptors_for_a_peer_that_does_not_read_are_limited(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MAX_UNSENT_FDS", 10)
+    one, other = pair()
+    reading, writing = os.pipe()
+    one.send(b"x" * 1_000_000)
+    for _ in range(11):
+        assert not one._closed
+        one.send(b"with", writing)
+    assert one._closed
+    other.close()
+    os.close(writing)
+    assert os.read(reading, 1) == b"", "all copies of the pipe's other end are closed"
+    os.close(reading)
+
+
+@pytest.mark.parametrize("end", ["read", "close"])
+async def test_drain_waits_until_the_peer_reads_or_the_end(end: str) -> None:
+    one, other = pair()
+    await one.drain(0)
+    for _ in range(5):
+        one.send(b"x" * 1_000_000)
+    draining = asyncio.create_task(one.drain(2))
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert not draining.done()
+    if end == "read":
+        for _ in range(4):
+            await other.receive()
+    else:
+        one.close()
+    async with asyncio.timeout(60):
+        await draining
+    one.close()
+    other.close()
+
+
 async def test_a_line_without_end_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_LINE", 1000)
     one, sock = socket.socketpair()

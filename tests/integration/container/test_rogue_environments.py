@@ -10,11 +10,14 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
+from support.container_specs import MACHINE
 from support.containers import Machine, until
 
-from rce.control.model import EndpointState, EndpointStatus, NodeState, NodeStatus
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce_container import intake
 from rce_container.environment import messages as m
 from rce_container.environment import proc
+from rce_container.environment.channel import Channel
 
 BOX, VICTIM = "user/box", "other/box"
 
@@ -120,6 +123,53 @@ async def test_who_never_stops_talking_keeps_nobody_waiting(machine: Machine) ->
         assert not talking.done()
         talking.cancel()
         await machine.drop("third/box")
+
+
+def channel_of(machine: Machine, id_: str) -> Channel:
+    (channel,) = [one._channel for one in machine.manager._incarnations.values() if one.id == id_]
+    assert channel is not None
+    return channel
+
+
+async def test_answers_that_are_not_read_are_limited(machine: Machine) -> None:
+    async with taken_over(machine, report(BOX)) as (rogue, _):
+        channel = channel_of(machine, BOX)
+        asking = asyncio.create_task(rogue.say(*[m.encode(m.Killed(request=1)) + b"\n"] * 20_000))
+        await until(lambda: len(channel._unsent) > intake.MAX_UNREAD, what="answers wait")
+        await machine.put("third/box")
+        await mark_of(machine, "third/box")
+        assert len(channel._unsent) < 1000
+        assert not asking.done(), "its questions were read all the same"
+
+        async def read() -> None:
+            while not asking.done():
+                await asyncio.get_running_loop().sock_recv(rogue.manager, 1 << 16)
+
+        async with asyncio.timeout(60):
+            await read()
+        await machine.drop("third/box")
+
+
+async def test_dialed_sockets_that_are_not_taken_are_limited(machine: Machine) -> None:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(str(machine.folder / "peer"))
+    listener.listen(4096)
+    address = LinkAddress(machine=MACHINE, unix=str(machine.folder / "peer"))
+    with listener:
+        async with taken_over(machine, report(BOX)) as (rogue, _):
+            await machine.put(BOX, 2, peer="other/box", dial=address)
+            channel = channel_of(machine, BOX)
+            before = len(list(Path("/proc/self/fd").iterdir()))
+            asking = asyncio.create_task(
+                rogue.say(*[m.encode(m.Dial(request=1, address=address)) + b"\n"] * 5000)
+            )
+            await until(lambda: len(channel._unsent) > intake.MAX_UNREAD, what="answers wait")
+            await machine.put("third/box")
+            await mark_of(machine, "third/box")
+            assert len(list(Path("/proc/self/fd").iterdir())) - before < 400
+            assert not asking.done(), "its questions were read all the same"
+            asking.cancel()
+            await machine.drop("third/box")
 
 
 async def test_descriptors_that_nobody_wants_are_not_kept(machine: Machine) -> None:
