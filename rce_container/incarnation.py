@@ -363,8 +363,7 @@ class Incarnation:
         while (line := await channel.receive()) is not None:
             pace.pay(intake.PER_LINE + len(line))
             self._handle_message(channel, intake.read(line), pace)
-            if pause := pace.pause:
-                await asyncio.sleep(pause)
+            await asyncio.sleep(pace.pause)  # also for 0 s: others have their turns between two lines
             await channel.drain(intake.MAX_UNREAD)
 
     def _handle_message(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:

@@ -63,6 +63,8 @@ PER_PART = 500
 """The same for each interface and connection of a specification that it requests again."""
 PER_LOOK = 100_000
 """The same for a line that makes the manager search for processes."""
+PER_PROCESS = 500
+"""The same for each process of the container in such a search."""
 
 MAX_UNREAD = 64
 """Lines that may wait for an environment to read them; while there are more, its own are not read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -13,6 +14,9 @@ from rce_container.environment import proc
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+_LOOK_AGAIN_S = 1.0
+"""Seconds before a process that was not found is searched for again."""
+
 
 class OuterStatus:
     """The reported status of one incarnation, with the pids that the machine sees.
@@ -20,13 +24,21 @@ class OuterStatus:
     Args:
         pids: Return the pids of the container's processes as the machine sees them; None if the environment
             reports these.
+        clock: Seconds of a monotonic clock.
     """
 
-    def __init__(self, pids: Callable[[], Iterable[int]] | None) -> None:
+    def __init__(
+        self, pids: Callable[[], Iterable[int]] | None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._list_pids = pids
+        self._clock = clock
         self._observed: ObservedStatus | None = None
         self._pids: dict[int, int] = {}
         """Pid inside the container to pid outside."""
+        self._missing: set[int] = set()
+        """Pids inside that the newest search did not find."""
+        self._looked = 0.0
+        """When it was."""
 
     @property
     def node_pids(self) -> dict[str, int]:
@@ -65,9 +77,14 @@ class OuterStatus:
     def _with_outer_pids(
         self, status: EndpointStatus, pids: Callable[[], Iterable[int]], pace: intake.Pace
     ) -> tuple[NodeStatus, ...]:
-        if any(node.pid and node.pid not in self._pids for node in status.nodes):
-            pace.pay(intake.PER_LOOK)
-            self._pids = {proc.inner_pid(pid): pid for pid in pids()}
+        unknown = {node.pid for node in status.nodes if node.pid} - self._pids.keys()
+        now = self._clock()
+        if unknown - (self._missing if now - self._looked < _LOOK_AGAIN_S else set()):
+            found = list(pids())
+            pace.pay(intake.PER_LOOK + intake.PER_PROCESS * len(found))
+            self._pids = {proc.inner_pid(pid): pid for pid in found}
+            self._missing = unknown - self._pids.keys()
+            self._looked = now
         return tuple(
             msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
             for node in status.nodes
