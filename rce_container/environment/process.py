@@ -19,20 +19,11 @@ OF_NODES = 600
 """The kernel kills nodes before the environment, which has to report it."""
 
 _PR_SET_PDEATHSIG = 1
-_PR_SET_DUMPABLE = 4
 _PR_SET_CHILD_SUBREAPER = 36
 _ATTEMPTS = 20
 _ATTEMPT_PAUSE_S = 0.0002
 _STRIKES = 100
 _STRIKE_PAUSE_S = 0.02
-
-
-def set_undumpable() -> None:
-    """Prevent other processes of the same user, such as the container's nodes, from inspecting this one.
-
-    It holds the sockets of the container's control and links and the links' tokens.
-    """
-    _prctl(_PR_SET_DUMPABLE, 0)
 
 
 def set_oom_score(score: int, pid: int | None = None) -> None:

@@ -15,6 +15,7 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 
+from rce_container.descent import FOLDER, MAX_DEPTH
 from rce_container.forkserver.kernel import Mount, mount
 from rce_container.forkserver.messages import VolumeOrder
 
@@ -26,9 +27,6 @@ _CONFIG = struct.Struct("=II 5Q 4I 64s 64s 32s 2Q 8Q")
 _ATTEMPTS = 64
 _LOCK_S = 2.0
 _LOCK_PAUSE_S = 0.01
-_MAX_DEPTH = 500
-"""How deep folders may be nested: a descriptor is open for each of those above the present one."""
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
 OPTIONS = "noinit_itable"
 """Options of a mount; without it the kernel would free space of the image that is reserved for inodes."""
@@ -138,7 +136,7 @@ def _give(folder: str, owner: int) -> None:
     if os.lstat(folder).st_uid == owner:
         return
     os.chown(folder, os.geteuid(), -1)  # the owner's at last: an interrupted change is repeated
-    fd = os.open(folder, _FOLDER)
+    fd = os.open(folder, FOLDER)
     levels = [os.scandir(fd)]
     try:
         while levels:
@@ -148,8 +146,8 @@ def _give(folder: str, owner: int) -> None:
                 continue
             os.chown(entry.name, owner, owner, dir_fd=fd, follow_symlinks=False)
             if stat.S_ISDIR(os.stat(entry.name, dir_fd=fd, follow_symlinks=False).st_mode):
-                if len(levels) > _MAX_DEPTH:
-                    raise OSError(errno.ENAMETOOLONG, f"folders are nested more than {_MAX_DEPTH} deep")
+                if len(levels) > MAX_DEPTH:
+                    raise OSError(errno.ENAMETOOLONG, f"folders are nested more than {MAX_DEPTH} deep")
                 fd = _replace(fd, entry.name)
                 levels.append(os.scandir(fd))
     finally:
@@ -162,6 +160,6 @@ def _give(folder: str, owner: int) -> None:
 
 def _replace(folder: int, name: str) -> int:
     """Open a folder in, or above, one that is open, and close that one."""
-    fd = os.open(name, _FOLDER, dir_fd=folder)
+    fd = os.open(name, FOLDER, dir_fd=folder)
     os.close(folder)
     return fd

@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 from rce.model import is_name
+from rce_container.descent import FOLDER
 from rce_container.exceptions import VolumeError
 from rce_container.files import remove, write_whole
 from rce_container.folder import make_accessible
@@ -23,7 +24,6 @@ from rce_container.volumes.mounted import open_image, open_inside
 
 _log = logging.getLogger(__name__)
 
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
 SETTLE_S = 10.0
 """Seconds that a former container's mount may take to end."""
 
@@ -102,7 +102,7 @@ class VolumePlaces:
         image = self.image(id_)
         try:
             if self.folder(id_).is_dir():
-                return os.open(self.folder(id_), _FOLDER)
+                return os.open(self.folder(id_), FOLDER)
             images.wait_until_unused(image, time.monotonic() + SETTLE_S)
             return open_image(image, self._point(), read_only=True)
         except OSError as error:
@@ -118,7 +118,7 @@ class VolumePlaces:
         """
         try:
             if self.folder(id_).is_dir():
-                return os.open(self.folder(id_), _FOLDER)
+                return os.open(self.folder(id_), FOLDER)
             root = open_inside(pid, path)
         except OSError as error:
             raise VolumeError(f"its files cannot be read: {error}") from error
@@ -149,7 +149,7 @@ class VolumePlaces:
         try:
             if not self._images:
                 path = self.make_scratch()
-                return path, os.open(path, _FOLDER)
+                return path, os.open(path, FOLDER)
             self.make_folder(self._scratch)
             path = self._scratch / f"{secrets.token_hex(8)}.img"
             return path, self._make_image(path, size)

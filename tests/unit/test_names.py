@@ -84,7 +84,7 @@ BANS = (
     Ban("=rock", "the loop of a server", "serve", kinds=FUNCTION),
     Ban("=die_before_others", "what the kernel kills first", "set_oom_score"),
     Ban("=strike_all", "killing processes of a mark", "kill_marked"),
-    Ban("=keep_to_oneself", "a process that others cannot read", "set_undumpable"),
+    Ban("=keep_to_oneself", "a process that others cannot read", "set_dumpable"),
     Ban("=limit_oneself oneself", "limits of a process", "set_rlimits"),
     Ban("=class_name =cls_name =kind_name", "the type of a message", "message_type"),
     Ban("=ContainerData =ResizeData =ContainerSpec", "what a container asks for", "Resources"),
