@@ -152,7 +152,8 @@ class ForkedProcess:
                 lambda: asyncio.StreamReaderProtocol(stdout), pipe
             )
         except BaseException:
-            pipe.close()
+            with contextlib.suppress(OSError):  # uvloop has closed it if this is cancelled
+                pipe.close()
             prepared.withdraw()
             raise
         process = cls(prepared.pid, stdout)

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Protocol
 
 import psutil
 import pytest
+import uvloop
 
+from rce.supervision.prefork import ForkedProcess, Prepared
 from rce.supervision.process import Child
 
 PART = """
@@ -153,6 +156,25 @@ async def test_a_fork_that_was_killed_before_it_began_fails_the_start(start: Sta
     async with asyncio.timeout(60):
         while any(psutil.pid_exists(pid) for pid in pids):
             await asyncio.sleep(0.02)
+
+
+def test_a_fork_ends_if_its_begin_is_cancelled() -> None:
+    wait, go = os.pipe()
+    output, print_ = os.pipe()
+    process = subprocess.Popen(["cat"], stdin=wait, stdout=print_)
+    os.close(wait)
+    os.close(print_)
+
+    async def begin() -> None:
+        task = asyncio.create_task(ForkedProcess.begin(Prepared(process.pid, go, output)))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    uvloop.run(begin())
+    assert not psutil.pid_exists(process.pid)
+    process.wait()
 
 
 async def test_forks_end_when_their_supervisor_is_told_to(start: Start) -> None:
