@@ -7,6 +7,7 @@ import contextlib
 import hmac
 import logging
 import socket
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -162,7 +163,8 @@ class LinkHub:
         for acceptor in self._doormen:
             await acceptor.close()
         await self._greetings.close()
-        await asyncio.sleep(0)  # connections that were just being accepted are registered
+        for _ in range(2):  # connections that were just being accepted get their carriers, and open
+            await asyncio.sleep(0)
         carriers = list(self._carriers)
         for carrier in carriers:
             carrier.abort(LinkLostError("the hub is closed"))
@@ -289,26 +291,26 @@ class LinkHub:
     # Accepting
 
     def _new_carrier(self) -> SocketCarrier:
-        return self._keep(SocketCarrier(self.limits, self.timeouts, on_closed=self._carriers.discard))
-
-    def _accept(self, received: bytes = b"") -> SocketCarrier:
-        return self._keep(
-            SocketCarrier(
-                self.limits,
-                self.timeouts,
-                received=received,
-                max_early=_MAX_EARLY,
-                on_open=self._admit,
-                on_closed=self._carriers.discard,
-            )
+        return SocketCarrier(
+            self.limits, self.timeouts, on_open=self._carriers.add, on_closed=self._carriers.discard
         )
 
-    def _keep(self, carrier: SocketCarrier) -> SocketCarrier:
-        self._carriers.add(carrier)
-        return carrier
+    def _accept(self, received: bytes = b"", guest: Guest | None = None) -> SocketCarrier:
+        """Make the carrier of an accepted connection, which may have a place in the lobby already."""
+        return SocketCarrier(
+            self.limits,
+            self.timeouts,
+            received=received,
+            max_early=_MAX_EARLY,
+            on_open=partial(self._admit, former=guest),
+            on_closed=self._carriers.discard,
+        )
 
-    def _admit(self, carrier: SocketCarrier) -> None:
+    def _admit(self, carrier: SocketCarrier, former: Guest | None) -> None:
         """Wait for the HELLO of an accepted connection, if there is room."""
+        self._carriers.add(carrier)
+        if former is not None:
+            former.leave()
         crowded = LinkLostError("too many connections come at once")
         guest = self.lobby.enter(address_of(carrier.peer), lambda: carrier.abort(crowded))
         if self._closed or guest is None:
@@ -346,13 +348,22 @@ class LinkHub:
         carrier.close()
 
     async def _adopt_secure(self, sock: socket.socket, link_id: str) -> None:
-        """Begin TLS as the accepting end; then continue as with any other connection."""
+        """Begin TLS as the accepting end, if there is room; then continue as with any other connection."""
+        task = asyncio.current_task()
+        assert task is not None
+        guest = self.lobby.enter(address_of(sock.getpeername()), task.cancel)
+        if guest is None:
+            sock.close()
+            return
         try:
             async with asyncio.timeout(self.timeouts.handshake):
-                await accept_secure(sock, (await self._wait_for(link_id)).spec, self._accept)
+                link = await self._wait_for(link_id)
+                await accept_secure(sock, link.spec, partial(self._accept, guest=guest))
         except (LinkRefusedError, OSError) as error:
             sock.close()
             _log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
+        finally:
+            guest.leave()
 
     async def _find(self, hello: Hello) -> Link:
         """Return the link that a peer asks for."""

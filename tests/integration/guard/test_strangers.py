@@ -13,13 +13,15 @@ from aiohttp import ClientSession, web
 from support.cloud import DIGEST, SECRET, running_cloud
 from websockets.asyncio.client import connect
 
+from rce.control.model import LinkAddress, LinkSpec
 from rce.control_channel.server import ControlServer
 from rce.guard.lobby import Lobby
 from rce.link.exceptions import LinkRefusedError
 from rce.link.frame_reader import FrameReader
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
-from rce.link.handshake import check_answer, encode_hello
+from rce.link.handshake import check_answer, encode_hello, encode_secure
 from rce.link.hub import LinkHub
+from rce.link.link import Link
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import Context, TlsFiles, TlsIdentity
@@ -174,6 +176,18 @@ async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
         await (await peer.ping())
 
 
+async def acceptor_for(hub: LinkHub, stack: AsyncExitStack, limits: LinkLimits) -> LinkAcceptor:
+    """Make an acceptor that hands the link L over to a hub."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, hub.adopt)
+    stack.callback(sender.close)
+    stack.push_async_callback(receiver.close)
+    acceptor = LinkAcceptor(TIMEOUTS, limits)
+    stack.push_async_callback(acceptor.close)
+    await acceptor.assign(sender, ["L"])
+    return acceptor
+
+
 @pytest.mark.parametrize("first", [b"", encode_hello("unheard of", "t")])
 @pytest.mark.parametrize("way", ["hub", "link acceptor"])
 async def test_links_are_answered(way: str, first: bytes) -> None:
@@ -185,13 +199,7 @@ async def test_links_are_answered(way: str, first: bytes) -> None:
             port = await hub.listen_tcp(ADDRESS, 0)
             lobby = hub.lobby
         else:
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, hub.adopt)
-            stack.callback(sender.close)
-            stack.push_async_callback(receiver.close)
-            acceptor = LinkAcceptor(TIMEOUTS, limits)
-            stack.push_async_callback(acceptor.close)
-            await acceptor.assign(sender, ["L"])
+            acceptor = await acceptor_for(hub, stack, limits)
             port = await acceptor.listen(ADDRESS, 0)
             lobby = acceptor.lobby
         async with held_open(port, first) as crowd:
@@ -204,3 +212,23 @@ async def test_links_are_answered(way: str, first: bytes) -> None:
                 check_answer(FrameReader(limits).feed(await reader.read(1000))[0])
             writer.close()
             await writer.wait_closed()
+
+
+async def test_tls_handshakes_of_links_are_counted() -> None:
+    """The process that has the link counts them, also if another one accepted the connections."""
+    limits = LinkLimits(unauthenticated_per_address=FEW)
+    async with AsyncExitStack() as stack:
+        hub = LinkHub("here", LinkTimeouts(handshake=60.0), limits)
+        stack.push_async_callback(hub.close)
+        spec = LinkSpec(id="L", peer="u/a", token="secret", dial=False, address=LinkAddress())
+        hub.register(Link(spec, limits))
+        acceptor = await acceptor_for(hub, stack, LinkLimits())
+        port = await acceptor.listen(ADDRESS, 0)
+        async with asyncio.timeout(60), held_open(port, encode_secure("L")):
+            while hub.lobby.turned_away < MANY - FEW:
+                await asyncio.sleep(0.01)
+            assert len(hub.lobby) == FEW
+        async with asyncio.timeout(60):
+            while hub.lobby:
+                await asyncio.sleep(0.01)
+        assert not hub._carriers

@@ -9,6 +9,7 @@ import ssl
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 
 from rce.control.model import LinkAddress, LinkSpec
 from rce.link import LinkHub
@@ -74,17 +75,18 @@ async def test_payload_and_token_do_not_cross_in_clear(rig: Rig, way: str) -> No
     assert len(tap.seen) > len(payload)
 
 
-@SECURE
+@pytest.mark.parametrize("way", ["secure", "handed-over-secure", "handed-over"])
 async def test_peer_without_the_token_is_refused(
     rig: Rig, way: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """One line in the log, no traceback."""
+    """One line in the log, no traceback, and nothing is kept of its connection at either end."""
     _, b = await rig.pair(way)
     a = rig.party("a", await rig.hub())
     await rig.join(a, b, [TOPIC_OUT])
     await a.connected(1)
     stranger = await rig.hub()
-    spec = LinkSpec(id="L", peer="u/b", token="another", dial=True, address=b.address)
+    address = replace(b.address, tls=True)
+    spec = LinkSpec(id="L", peer="u/b", token="another", dial=True, address=address)
     with caplog.at_level(logging.INFO), pytest.raises((OSError, LinkLostError)):
         await stranger.connect(spec)
     async with asyncio.timeout(60):
@@ -92,6 +94,9 @@ async def test_peer_without_the_token_is_refused(
             await asyncio.sleep(0.01)
     assert not any(record.exc_info for record in caplog.records)
     assert a.endpoint.connections == (1,), "the link itself continues"
+    async with asyncio.timeout(60):
+        while stranger._carriers or len(b.hub._carriers) > 1:
+            await asyncio.sleep(0.01)
 
 
 @SECURE
