@@ -52,7 +52,8 @@ class Link:
         self.was_left = False
         self.on_successor: Callable[[Carrier], None] | None = None
         self.on_take: Callable[[], None] = lambda: None
-        self._was_copy = False
+        self._peer_is_copy = False
+        """Whether the peer's last connection came from a copy that has not taken over, as far as is known."""
         self._on_growth = on_growth
         self._channels: dict[int, Channel] = {}
         self._pacer: Pacer | None = None
@@ -118,11 +119,12 @@ class Link:
                 takes over, if it has done so before.
             copy: Whether the peer is a copy: its connection stands beside the present one, or beside none.
         """
-        is_copy = self.spec.copy or self._was_copy
-        if copy and not is_copy and self.on_successor is not None:
+        beside_none = self.spec.copy or self._peer_is_copy
+        if copy and not beside_none and self.on_successor is not None:
             self.on_successor(carrier)
             return
         self.attach(carrier)
+        self._peer_is_copy = copy
         if (standby or copy) and not self.spec.copy:
             self._tell(FrameType.TAKE)
 
@@ -131,7 +133,6 @@ class Link:
         takes_over = self.spec.copy and not spec.copy
         self.spec = spec
         if takes_over:
-            self._was_copy = True
             self._tell(FrameType.TAKE)
             for channel in self:
                 channel.slot.send_latched(channel)
@@ -170,6 +171,8 @@ class Link:
         """
         number = frame.channel
         channel = self._channels.get(number)
+        if frame.type is FrameType.TAKE or frame.type >= FrameType.DATA:
+            self._peer_is_copy = False
         if frame.type is FrameType.OPEN:
             if len(self.peer_open) >= self.limits.max_channels:
                 raise ProtocolError("too many open channels")
@@ -184,8 +187,6 @@ class Link:
         elif frame.type in (FrameType.TAKE, FrameType.LEAVE):
             self._peer_moved(frame.type)
         elif channel is not None:
-            if frame.type is FrameType.DATA:
-                self._was_copy = False  # the peer has noticed that this end took over
             channel.frame_received(frame)
         elif frame.type < FrameType.DATA:
             raise ProtocolError(f"{frame.type.name} after the handshake")

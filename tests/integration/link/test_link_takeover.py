@@ -218,3 +218,26 @@ async def test_links_that_break_before_the_takeover_are_made_again(move: Move, *
     await former.connected()
     assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
     assert copy.fakes["i3"].asked.is_set()
+
+
+async def test_both_ends_are_moved_one_after_the_other(rig: Rig) -> None:
+    """The second move's copy is silent until it takes over, also if only calls came from its end before."""
+    one, other = await rig.pair("unix", quiet=0.1, take=1.0)
+    moved, moved_later = rig.party("b", await rig.hub()), rig.party("a", await rig.hub())
+    await rig.listen(moved, "unix")
+    await rig.join(one, other, ENDS)
+    await one.connected(*ALL)
+    first, second = Move(one, other, moved), Move(moved, one, moved_later)
+    await first.begin(robot_dials=True)
+    await first.take_over()
+    await other.connected()
+    assert await one.fakes["i3"].port.call(b"call") == b"CALL"
+    await second.begin(robot_dials=False)
+    assert await one.fakes["i3"].port.call(b"still") == b"STILL"
+    assert one.fakes["i3"].active == [True]
+    await second.take_over()
+    assert await moved_later.fakes["i3"].port.call(b"new") == b"NEW"
+    moved.fakes["i2"].port.send(b"to the new place")
+    assert await moved_later.fakes["i2"].received.get() == (b"to the new place", False)
+    await one.connected()
+    assert moved.endpoint.connections == ALL
