@@ -74,6 +74,14 @@ def _take_note(sent: asyncio.Future[None]) -> None:
         sent.exception()
 
 
+async def _until_sent(messages: list[asyncio.Future[None]]) -> None:
+    """Wait until each message was handed to the network, or the connection ended."""
+    for sent in messages:
+        sent.add_done_callback(_take_note)
+    if messages:
+        await asyncio.wait(messages)
+
+
 def is_failure(state: State, words: str) -> bool:
     """Return whether a report of a state says that an attempt to connect failed."""
     return state is State.CONNECTING and words != CONNECTING
@@ -177,21 +185,17 @@ class Session:
         self.check_open()
         self.desired.apply(request)
         # All parts at once: if this is cancelled, none is left out.
-        sent = [self.transport.deliver(encode(part), self._keep(part)) for part in parts_of(request)]
-        for one in sent:
-            one.add_done_callback(_take_note)
-        await asyncio.wait(sent)
+        await _until_sent(
+            [self.transport.deliver(encode(part), self._keep(part)) for part in parts_of(request)]
+        )
 
     async def repeat(self) -> None:
         """Send all stored requests again; without a connection none, :meth:`on_connected` sends them."""
         self.check_open()
-        for request in self.desired.restore():
-            for part in parts_of(request):
-                if not self.transport.connected:
-                    return
-                sent = self.transport.deliver(encode(part))
-                sent.add_done_callback(_take_note)
-                await asyncio.wait((sent,))
+        if self.transport.connected:
+            # All at once: what the program removes while they wait is removed after them.
+            parts = [part for request in self.desired.restore() for part in parts_of(request)]
+            await _until_sent([self.transport.deliver(encode(part)) for part in parts])
 
     def check_open(self) -> None:
         """Raise unless the program may use the connection.

@@ -102,9 +102,14 @@ class Engine:
                 await asyncio.sleep(0.01)
 
     def stop_reading(self) -> None:
-        """Take nothing more from the robot's connection, until that is broken."""
+        """Take nothing more from the robot's connection, until that is broken or read again."""
         for socket in _server_sockets():
             socket.transport.pause_reading()
+
+    def read_again(self) -> None:
+        """Take what the robot's connection has sent meanwhile."""
+        for socket in _server_sockets():
+            socket.transport.resume_reading()
 
     def connection(
         self,

@@ -371,6 +371,25 @@ async def test_a_cancelled_request_is_sent_after_the_reconnect(engine: Engine) -
         assert conn.connected
 
 
+async def test_what_is_removed_during_a_repetition_stays_removed(engine: Engine) -> None:
+    """The requests before it wait to be sent."""
+    async with asyncio.timeout(60), engine.connection() as conn:
+        for tag in ("c1", "c2"):
+            await conn.create_container(tag)
+        await stall(engine, conn)
+        repetition = asyncio.create_task(conn.repeat_requests())
+        await asyncio.sleep(0)
+        removal = asyncio.create_task(conn.destroy_container("c2"))
+        await asyncio.sleep(0)
+        engine.read_again()
+        await asyncio.gather(repetition, removal)
+        await conn.create_container("last")
+        requests = engine.master.requests
+        await engine.master.changed.until(lambda: requests[-1][2].get("containerTag") == "last")
+        about_c2 = [kind for _, kind, data in requests if data.get("containerTag") == "c2"]
+        assert about_c2[-1] == "DC"
+
+
 async def test_an_interface_whose_making_was_cancelled_can_be_made(engine: Engine) -> None:
     async with engine.connection() as conn:
         making = asyncio.create_task(conn.publisher("say", STRING))
