@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce.protocol import NO_ID, CallId, DataMessage, ErrorReport
+from rce_client.early_messages import EarlyMessages
 from rce_client.exceptions import InterfaceError
 from rce_client.services import ServiceClient
 
@@ -12,9 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rce_client.interfaces import ClientInterface
-
-_MOST_EARLY = 64
-"""Topics, and sources of latched ones, whose last message is kept until the program makes their interface."""
 
 
 class InterfaceTable:
@@ -29,8 +27,7 @@ class InterfaceTable:
         self.active: dict[str, bool] = {}
         """Own interface tags to whether they are joined with a peer."""
         self._interfaces: dict[str, ClientInterface] = {}
-        self._early: dict[tuple[str, str], DataMessage] = {}
-        """By interface tag and source."""
+        self._early = EarlyMessages()
         self._withdrawn: set[str] = set()
         """Tags of own interfaces that were removed; what still comes for them is dropped."""
 
@@ -44,8 +41,7 @@ class InterfaceTable:
             interface.on_closed()
             raise InterfaceError(f"interface {interface.tag} is there already: close it before another one")
         self._interfaces[interface.tag] = interface
-        for key in [key for key in self._early if key[0] == interface.tag]:
-            early = self._early.pop(key)
+        for early in self._early.take(interface.tag):
             if interface.fits(early):
                 interface.deliver(early)
 
@@ -80,11 +76,7 @@ class InterfaceTable:
             if message.i_tag not in self._withdrawn or message.msg_id != NO_ID or interface.fits(message):
                 interface.deliver(message)
         elif message.msg_id == NO_ID and message.i_tag not in self._withdrawn:
-            key = message.i_tag, message.latch
-            self._early.pop(key, None)
-            self._early[key] = message
-            if len(self._early) > _MOST_EARLY:
-                del self._early[next(iter(self._early))]
+            self._early.keep(message)
 
     def set_active(self, tag: str, active: bool) -> None:
         """Note whether an interface is joined with a peer."""

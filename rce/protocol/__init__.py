@@ -27,7 +27,7 @@ from rce.protocol.messages import (
 )
 from rce.protocol.requests import MAX_ITEMS, read_request, write_request
 from rce.protocol.stream import Event, Fault, LargeData, LongRequest, ProtocolStream
-from rce.protocol.weight import Address, is_light, utf8_in_steps
+from rce.protocol.weight import Address, is_light, memory_of, utf8_in_steps
 
 __all__ = [
     "FEATURES",
@@ -59,6 +59,7 @@ __all__ = [
     "encode_data",
     "is_light",
     "master_reply",
+    "memory_of",
     "read_credentials",
     "read_features",
     "read_master_request",

@@ -1,4 +1,4 @@
-"""Estimates the cost of parsing a JSON text, by scans in C that make no objects.
+"""Estimates the cost of parsing a JSON text, by scans in C that make no objects; and the memory of values.
 
 A text is *light* if parsing and converting it takes a few milliseconds at most. Other texts are parsed
 outside the event loop. The estimate counts bytes, also those inside strings: a text that counts as light is
@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import codecs
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from sys import getsizeof
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from msgspec import Struct
 
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import NO_ID
@@ -110,6 +113,34 @@ def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:
             f"a message of {values} values is over the limit of {max_values}; "
             "send large data as binary values or through a Forwarder",
         )
+
+
+def memory_of(value: object) -> int:
+    """Return about how many bytes of memory a parsed message takes, which may be twenty times its text.
+
+    Args:
+        value: Parsed JSON, which may hold binary values; or a request, or a binary value.
+    """
+    size = 0
+    level: list[Any] = [value]
+    while level:
+        size += sum(map(getsizeof, level))
+        inner: list[Any] = []
+        for item in level:
+            kind = type(item)
+            if kind is str or kind is int or kind is float:
+                continue
+            if kind is dict:
+                inner += item.keys()
+                inner += item.values()
+            elif kind is list or kind is tuple:
+                inner += item
+            elif kind is memoryview:
+                size += item.nbytes
+            elif isinstance(item, Struct):
+                inner += [getattr(item, name) for name in item.__struct_fields__]
+        level = inner
+    return size
 
 
 def find_address(text: bytes) -> Address | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -11,8 +12,9 @@ from hypothesis import strategies as st
 from rce.protocol.exceptions import MessageError
 from rce.protocol.large import read_large
 from rce.protocol.messages import DataMessage
+from rce.protocol.reading import parse_json
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
-from rce.protocol.weight import Address, check_elements, find_address, is_light, utf8_in_steps
+from rce.protocol.weight import Address, check_elements, find_address, is_light, memory_of, utf8_in_steps
 
 STRING = "std_msgs/String"
 
@@ -124,3 +126,29 @@ def test_utf8_is_checked_in_steps(text: bytes, valid: bool) -> None:
     assert all(steps) == valid
     assert len(steps) <= len(text) // (256 * 1024) + 1
     assert not any(step is False for step in steps[:-1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"[" + b"{}," * 10_000 + b"0]",
+        b"[" + b"[]," * 10_000 + b"0]",
+        b"[" + b'{"a":1000},' * 10_000 + b"0]",
+        b"[" + b"1.5," * 10_000 + b"0]",
+        b"[" + b'"ab",' * 10_000 + b"0]",
+        b'["' + b"x" * 100_000 + rb'\ud83d\ude00"]',
+        b"{" + b",".join(b'"%d":[0]' % number for number in range(10_000)) + b"}",
+    ],
+    ids=["objects", "lists", "members", "numbers", "texts", "wide text", "keys"],
+)
+def test_memory_of_parsed_values_is_counted(text: bytes) -> None:
+    """It may be many times the text."""
+    parse_json(text)  # what it caches is there now
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        value = parse_json(text)
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert 0.75 * grown <= memory_of(value) <= 3 * grown  # Python keeps some objects for reuse
