@@ -16,6 +16,8 @@ from rce_client.interfaces import ClientInterface, InterfaceOwner, LatchListener
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 
+    from rce.protocol import Frame
+
 
 _log = logging.getLogger(__name__)
 
@@ -81,8 +83,9 @@ class Publisher(ClientInterface, Generic[M]):
         """
         if not latch:
             return self._owner.post_data(self.tag, self._frames(message))
+        frames = self._latched_frames(message, latch)
         self._latched[latch] = message
-        return self._owner.is_active(self.tag) and self._post(message, latch)
+        return self._owner.is_active(self.tag) and self._owner.post_data(self.tag, frames, latch)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
         """Withdraw the latched messages of all sources except these.
@@ -106,7 +109,12 @@ class Publisher(ClientInterface, Generic[M]):
     def on_active(self) -> None:
         """Send the latched messages again: the engine may not have them."""
         for source, message in self._latched.items():
-            self._post(message, source)
+            try:
+                frames = self._latched_frames(message, source)
+            except Exception:  # noqa: BLE001 - logged; the program has changed it since
+                _log.exception("latched message of publisher %s", self.tag)
+            else:
+                self._owner.post_data(self.tag, frames, source)
         self.keep_latched(tuple(self._latched))
         self._tell_demand(needed=True)
 
@@ -120,11 +128,13 @@ class Publisher(ClientInterface, Generic[M]):
 
     def _tell_demand(self, *, needed: bool) -> None:
         if self._on_demand is not None:
-            self._on_demand(needed)
+            try:
+                self._on_demand(needed)
+            except Exception:  # noqa: BLE001 - logged; it must not end anything else
+                _log.exception("callback of publisher %s", self.tag)
 
-    def _post(self, message: M, latch: str) -> bool:
-        source = latch if self._owner.knows_sources else ""
-        return self._owner.post_data(self.tag, self._frames(message, latch=source), latch)
+    def _latched_frames(self, message: M, source: str) -> list[Frame]:
+        return self._frames(message, latch=source if self._owner.knows_sources else "")
 
     def deliver(self, message: DataMessage) -> None:
         """Ignore the message; the engine sends none to a publisher."""
@@ -196,7 +206,10 @@ class Subscriber(ClientInterface, Generic[M]):
     def keep_latched(self, sources: Sequence[str]) -> None:
         """Tell the listener which sources are still there."""
         if self._latches is not None:
-            self._latches.keep_latched(sources)
+            try:
+                self._latches.keep_latched(sources)
+            except Exception:  # noqa: BLE001 - logged; it must not end anything else
+                _log.exception("listener of subscriber %s", self.tag)
 
     async def __aiter__(self) -> AsyncIterator[M]:
         """Yield messages until the program closes the subscriber or the connection.
