@@ -8,6 +8,7 @@ import logging
 import uuid
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from rce.aio.tasks import pass_cancellation
 from rce.model import Role
 from rce.protocol import CallId, DataMessage
 from rce_client.exceptions import CallError, CallTimeoutError, NotConnectedError
@@ -151,7 +152,8 @@ class ServiceProvider(ClientInterface, Generic[M]):
         except CallError as error:  # the handler asked another service
             _log.warning("service %s: %s", self.tag, error)
             answer = str(error)
-        except Exception as error:  # noqa: BLE001 - logged; it must not end anything else
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - logged, and the caller gets it
+            pass_cancellation(error)
             _log.exception("handler of service %s", self.tag)
             answer = f"{type(error).__name__}: {error}"  # a string is the engine's sign for a failure
         self._answer(message.msg_id, answer)
@@ -159,7 +161,7 @@ class ServiceProvider(ClientInterface, Generic[M]):
     def _answer(self, msg_id: str, answer: object) -> None:
         try:
             frames = self._frames(answer, msg_id)
-        except TypeError as error:
+        except Exception as error:  # noqa: BLE001 - logged, and the caller gets it
             _log.exception("answer of service %s", self.tag)
             frames = self._frames(f"the answer cannot be sent: {error}", msg_id)
         if not self._owner.post_control(frames):

@@ -8,6 +8,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from rce.aio.tasks import pass_cancellation
 from rce.model import Role
 from rce.protocol import DataMessage, LatchedSources, encode
 from rce_client.exceptions import InterfaceError
@@ -247,5 +248,6 @@ class Subscriber(ClientInterface, Generic[M]):
                 awaitable = self._callback(message)
                 if awaitable is not None:
                     await awaitable
-            except Exception:  # noqa: BLE001 - logged; it must not end anything else
+            except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - as above
+                pass_cancellation(error)
                 _log.exception("callback of subscriber %s", self.tag)

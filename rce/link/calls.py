@@ -6,7 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from rce.aio.tasks import BackgroundTasks
+from rce.aio.tasks import BackgroundTasks, pass_cancellation
 from rce.guard import Holding, Holdings
 from rce.link.exceptions import NotConnectedError, OverloadedError
 from rce.link.frames import MAX_ID
@@ -155,7 +155,8 @@ class CallServer:
     async def _run(self, channel: Channel, call_id: int, payload: bytes) -> None:
         try:
             answer = await self._serve(payload)
-        except Exception as error:  # noqa: BLE001 - logged
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - logged
+            pass_cancellation(error)
             _log.debug("%s: request failed", self._name, exc_info=True)
             if self._finish(channel, call_id):
                 channel.fault(call_id, error)

@@ -180,7 +180,7 @@ class Channel:
         except (TypeError, MessageTooLargeError, OverloadedError) as error:
             self.fault(call_id, error)
 
-    def fault(self, call_id: int, error: Exception) -> None:
+    def fault(self, call_id: int, error: BaseException) -> None:
         """Answer a request with a fault."""
         carrier = self.link.carrier
         if carrier is not None:

@@ -38,7 +38,7 @@ class FakeChannel:
         self.replies[call_id] = answer
         self.answered.set()
 
-    def fault(self, call_id: int, error: Exception) -> None:
+    def fault(self, call_id: int, error: BaseException) -> None:
         self.faults[call_id] = str(error)
         self.answered.set()
 
@@ -164,6 +164,25 @@ async def test_what_a_server_raises_is_told_to_the_peer() -> None:
     server.accept(channel.as_channel(), 1, b"")
     await channel.answered.wait()
     assert channel.faults == {1: "nothing like that here"}
+    await server.close()
+
+
+async def test_server_that_waits_for_a_cancelled_task_answers() -> None:
+    """Only a cancelled request gets no answer."""
+
+    async def serve(payload: bytes) -> bytes:
+        task = asyncio.create_task(asyncio.sleep(0))
+        task.cancel()
+        await task
+        return payload
+
+    channel, holdings = FakeChannel(), Holdings()
+    server = CallServer(serve, LinkLimits(), "test", holdings)
+    server.accept(channel.as_channel(), 1, b"request")
+    async with asyncio.timeout(60):
+        await channel.answered.wait()
+    assert list(channel.faults) == [1]
+    assert holdings.bytes == 0
     await server.close()
 
 
