@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rce.aio.queues import OverflowPolicy
 from rce.link import Interface, Port
 from rce_robot.exceptions import MisdirectedError, RobotError, UnreadableError
-from rce_robot.offload import Offload, Read
+from rce_robot.offload import Offload, Read, pack_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -194,6 +194,17 @@ class RobotInterface(Interface):
     def _read(self, message: DataMessage, warn: Callable[[str], None]) -> Buffer:
         try:
             return self.form_in.read(message.msg, warn)
+        except UnreadableError as error:
+            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
+
+    def _pack(self, message: DataMessage) -> bytes:
+        """Pack a message for its conversion in another process.
+
+        Raises:
+            UnreadableError: It fits no type.
+        """
+        try:
+            return pack_value(message.msg)
         except UnreadableError as error:
             raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError, Port
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import RobotInterface, RobotSide
-from rce_robot.offload import Read, pack_value
 from rce_robot.outgoing import Buffer, fresh_id
 
 if TYPE_CHECKING:
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
     from rce.protocol import DataMessage, LargeData
     from rce_robot.forms import Form
+    from rce_robot.offload import Read
     from rce_robot.outgoing import Outgoing
 
 _log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ class AskedByRobot(RobotInterface):
     def take(self, message: DataMessage) -> None:
         """Start a call."""
         if self.form_in.costly:
-            packed = pack_value(message.msg)
+            packed = self._pack(message)
             work = self._convert_and_call(self.offload.read_value(packed), message.msg_id, len(packed))
             self._run(work, message.msg_id)
         else:
@@ -144,15 +144,15 @@ class AnsweredByRobot(RobotInterface):
         if isinstance(message.msg, str):
             answer.set_exception(PeerFaultError(message.msg))
             return
-        if self.form_in.costly:
-            packed = pack_value(message.msg)
-            self._convert(self.offload.read_value(packed), message.msg_id, len(packed))
-            return
         try:
-            answer.set_result(self._read(message, self._warn))
+            if not self.form_in.costly:
+                answer.set_result(self._read(message, self._warn))
+                return
+            packed = self._pack(message)
         except UnreadableError as error:
             answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {error}"))
             raise
+        self._convert(self.offload.read_value(packed), message.msg_id, len(packed))
 
     def take_large(self, large: LargeData) -> None:
         """Complete a call when its answer has been converted."""
@@ -163,7 +163,9 @@ class AnsweredByRobot(RobotInterface):
     def _convert(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         if not self.robot.run(self._complete(reading, msg_id, size)):
             reading.close()
-            raise BusyError.at(self.tag, msg_id, "too much is converted already")
+            problem = "too much is converted already"
+            self.refused(msg_id, problem)
+            raise BusyError.at(self.tag, msg_id, problem)
 
     async def _complete(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         """Complete a call with an answer that another process converts."""

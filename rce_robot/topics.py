@@ -10,7 +10,7 @@ from rce.protocol import NO_ID, DataMessage, LargeData
 from rce_robot.conversion import ConversionQueue
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import Delivery, RobotInterface, RobotSide
-from rce_robot.offload import Read, pack_value
+from rce_robot.offload import Read
 from rce_robot.outgoing import Buffer, Outgoing
 
 if TYPE_CHECKING:
@@ -50,10 +50,7 @@ class FromRobot(RobotInterface):
         if not (self.form_in.costly or self._queue.busy):
             self._pass_on(self._read(message, self._warn), message.latch)
             return
-        try:
-            packed = pack_value(message.msg)
-        except UnreadableError as error:
-            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
+        packed = self._pack(message)
         work = partial(self._convert_value, packed, message.msg_id, message.latch)
         self._put(len(packed), work, message.latch)
 

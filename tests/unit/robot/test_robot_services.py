@@ -9,13 +9,15 @@ from support.robot_interfaces import SERVICE, Setup, ros_string, shown
 
 from rce.aio.queues import OverflowPolicy
 from rce.link import (
+    Buffer,
     CallTimeoutError,
     NotConnectedError,
     OverloadedError,
     PeerFaultError,
     PeerLostError,
 )
-from rce_robot.exceptions import BusyError, MisdirectedError
+from rce.protocol import Address, CallId, LargeData
+from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.services import AnsweredByRobot
 
 
@@ -79,6 +81,49 @@ async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
         await setup.interface.serve(b"\x01")
     with pytest.raises(MisdirectedError, match="no call"):
         setup.take({}, "unknown")
+
+
+def with_pictures(type_: str) -> Setup:
+    """Return an interface whose messages are converted in another process."""
+    setup = Setup(type_, SERVICE)
+    setup.interface.form_in.costly = True
+    return setup
+
+
+def test_unreadable_request_of_a_costly_type_names_its_call() -> None:
+    setup = with_pictures("ServiceProviderConverter")
+    with pytest.raises(UnreadableError, match="longer than 64 bits") as caught:
+        setup.take({"data": 2**64}, "id1")
+    assert caught.value.call == CallId("tag", "id1")
+
+
+async def begun_call(setup: Setup) -> tuple[asyncio.Future[Buffer], str]:
+    """Call the robot's service; return the answer and the call's id."""
+    call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
+    await asyncio.sleep(0)
+    return call, shown(setup.robot.urgent[0])["msgID"]
+
+
+async def test_unreadable_answer_of_a_costly_type_fails_its_call() -> None:
+    setup = with_pictures("ServiceClientConverter")
+    call, msg_id = await begun_call(setup)
+    with pytest.raises(UnreadableError) as caught:
+        setup.take({"success": 2**64}, msg_id)
+    assert caught.value.call == CallId("tag", msg_id)
+    with pytest.raises(PeerFaultError, match="longer than 64 bits"):
+        await call
+
+
+@pytest.mark.parametrize("large", [False, True])
+async def test_answer_that_finds_no_room_fails_its_call(*, large: bool) -> None:
+    setup = with_pictures("ServiceClientConverter")
+    call, msg_id = await begun_call(setup)
+    setup.robot.room = False
+    data = LargeData(Address("tag", SERVICE, msg_id), b"{}")
+    with pytest.raises(BusyError):
+        setup.interface.take_large(data) if large else setup.take({"success": True}, msg_id)
+    with pytest.raises(PeerFaultError, match="too much is converted already"):
+        await call
 
 
 async def test_a_bad_request_of_a_peer_is_the_peers_to_know() -> None:
