@@ -5,7 +5,7 @@ followed by the bytes. The object then holds ``"key*": id`` instead of ``"key"``
 list of binary values. The frames of a message may arrive in any order and mixed with those of others.
 
 Invariants: every id is awaited by at most one message; an unclaimed value is awaited by none;
-``pending_bytes`` is the sum over all incomplete messages (their text and the values they have got) and all
+``pending_bytes`` is the sum over all incomplete messages (their memory and the values they have got) and all
 unclaimed values; both stay within the limits after every call.
 """
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 ID_LENGTH = 32
 """Length of the id at the start of a binary frame, in bytes."""
 
+PLACE_BYTES = 512
+"""Memory of the place of a binary value in an incomplete message, whether the value has come or not."""
 _ID = re.compile(r"[0-9A-Fa-f]{32}")
 _ID_BYTES = re.compile(rb"[0-9A-Fa-f]{32}")
 
@@ -88,7 +90,7 @@ class Assembler:
 
         Args:
             value: The JSON value; starred keys in it are replaced in place.
-            size: Length of the text, which counts as its memory.
+            size: Bytes of memory that it counts.
             now: Seconds on the caller's clock.
 
         Returns:
@@ -161,7 +163,7 @@ class Assembler:
             return True, []
         partial = _Partial(
             value,
-            size + sum(unclaimed.size for unclaimed in found),
+            size + PLACE_BYTES * len(places) + sum(unclaimed.size for unclaimed in found),
             now + self._limits.expiry,
             places,
             set(places).difference(unclaimed.id for unclaimed in found),

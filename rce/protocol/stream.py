@@ -38,7 +38,7 @@ from rce.protocol.reading import (
 )
 from rce.protocol.requests import is_long, read_in_steps
 from rce.protocol.single import MARK, SingleReader
-from rce.protocol.weight import Address, find_address, is_light
+from rce.protocol.weight import Address, find_address, is_light, memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Generator
@@ -258,7 +258,9 @@ class ProtocolStream:
                 check_request_size(value, len(text), limits.max_request)
             if not starred:
                 return [self._read(value)]
-            complete, dropped = self._assembler.add_message(value, len(text), now)
+            # What the engine does not defer has few values, which are counted fast.
+            size = memory_of(value) if self._defer_large else len(text)
+            complete, dropped = self._assembler.add_message(value, size, now)
         except ProtocolError as error:
             return [Fault.of(error, call_of(value))]
         return self._events(value if complete else None, dropped)

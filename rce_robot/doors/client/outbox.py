@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from rce_robot.doors.base import Queued
 
 
+_STATE_BYTES = 256
+"""Memory of an unsent statement beside its text: each interface may have one."""
+
+
 @dataclass(frozen=True, slots=True)
 class OutboxLimits:
     """The limits of one robot's queues. A queue always takes one message of any size."""
@@ -70,6 +74,7 @@ class Outbox:
         self._control: deque[tuple[Queued, int]] = deque()
         self._control_bytes = 0
         self._states: dict[str, Queued] = {}
+        self._state_bytes = 0
         self._flows: dict[str, _Flow] = {}
         self._ring: deque[_Flow] = deque()
         self._data_bytes = 0
@@ -82,12 +87,16 @@ class Outbox:
 
     @property
     def bytes(self) -> int:
-        """Bytes that wait in both lanes."""
-        return self._control_bytes + self._data_bytes + self._latched_bytes
+        """Bytes that wait in both lanes, and of statements."""
+        return self._state_bytes + self._control_bytes + self._data_bytes + self._latched_bytes
 
     def put_state(self, key: str, message: Queued) -> None:
         """Queue a statement that makes an earlier, unsent one of the same ``key`` obsolete (``ST``)."""
+        former = self._states.get(key)
+        if former is not None:
+            self._state_bytes -= _STATE_BYTES + former.size
         self._states[key] = message
+        self._state_bytes += _STATE_BYTES + message.size
 
     def put_control(self, message: Queued) -> bool:
         """Queue a small urgent message.
@@ -159,8 +168,9 @@ class Outbox:
     def pop(self) -> Queued | None:
         """Take the message to send next; return None if the queues are empty."""
         if self._states:
-            key = next(iter(self._states))
-            return self._states.pop(key)
+            state = self._states.pop(next(iter(self._states)))
+            self._state_bytes -= _STATE_BYTES + state.size
+            return state
         if self._control:
             message, size = self._control.popleft()
             self._control_bytes -= size
@@ -198,7 +208,7 @@ class Outbox:
         self._ring.clear()
         self._control.clear()
         self._states.clear()
-        self._data_bytes = self._control_bytes = self._latched_bytes = 0
+        self._state_bytes = self._data_bytes = self._control_bytes = self._latched_bytes = 0
 
     def _flow(self, tag: str, overflow: OverflowPolicy) -> _Flow:
         """Return the queue of an interface; make it if it does not exist."""

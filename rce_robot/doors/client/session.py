@@ -259,6 +259,7 @@ class Session:
             self._write(message)
         elif not self.lost:
             self._outbox.put_state(tag, message)
+            self._owner.grew()
 
     def discard(self, tag: str) -> None:
         """Drop the waiting messages of a removed interface."""

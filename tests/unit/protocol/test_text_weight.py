@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.protocol.assembler import PLACE_BYTES
 from rce.protocol.exceptions import MessageError
 from rce.protocol.large import read_large
 from rce.protocol.messages import DataMessage
@@ -76,7 +77,7 @@ def test_large_message_returns_with_its_binary_values() -> None:
     assert isinstance(large, LargeData)
     assert read_large(large.text, large.binaries, large.address) == [id_]
     assert stream.await_binaries(large, [id_], 0.0) == []
-    assert stream.pending_bytes == len(text)
+    assert stream.pending_bytes == len(text) + PLACE_BYTES
     (complete,) = stream.feed_binary(id_.encode() + b"bytes", 0.0)
     assert isinstance(complete, LargeData)
     message = read_large(complete.text, complete.binaries, complete.address)

@@ -55,6 +55,26 @@ def test_a_newer_state_replaces_an_unsent_one() -> None:
     assert drain(outbox) == ["off", "scan on"]
 
 
+def test_unsent_states_are_counted() -> None:
+    """A robot that does not read may have interfaces made and removed as long as it likes."""
+    outbox = Outbox()
+    for number in range(10_000):
+        outbox.put_state(f"tag{number}", message("inactive"))
+        outbox.put_state(f"tag{number}", message("active"))
+    assert outbox.bytes >= 10_000 * 200
+    for _ in range(5000):
+        outbox.pop()
+    half = outbox.bytes
+    assert half >= 5000 * 200
+    outbox.put_state("tag9999", message("active"))
+    assert outbox.bytes == half
+    outbox.clear()
+    assert outbox.bytes == 0
+    outbox.put_state("tag", message("active"))
+    outbox.pop()
+    assert outbox.bytes == 0
+
+
 def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
     outbox = Outbox(OutboxLimits(queue_messages=3))
     for index in range(10):
