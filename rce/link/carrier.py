@@ -90,7 +90,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
-        """Take a call back that has not begun to be sent; false if it is on its way."""
+        """Take a call back of which a part at least has not been sent; false if it is on its way."""
 
     @abstractmethod
     def clear(self, queue: OutgoingQueue) -> None:

@@ -80,15 +80,19 @@ class Lanes:
             self._enlist(queue)
 
     def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
-        """Take a call back that has not begun; false if it is on its way."""
-        return queue.withdraw(call_id)
+        """Take a call back; the peer is told if it has a part of it. False if all of it is on its way."""
+        return self._abort(queue, queue.give_up(call_id)) or queue.withdraw(call_id)
 
     def clear(self, queue: OutgoingQueue) -> None:
         """Throw away what waits on a channel; the peer is told if it has a part of it."""
-        begun = queue.clear()
+        self._abort(queue, queue.clear())
+
+    def _abort(self, queue: OutgoingQueue, begun: int) -> bool:
+        """Tell the peer that the rest of a message of ``begun`` bytes does not come; if 0, there is none."""
         if begun:
             self._begun_bytes -= begun
             self._control.append(encode(Frame(FrameType.ABORT, queue.channel)))
+        return bool(begun)
 
     def next(self, limit: int = FRAGMENT_SIZE) -> Chunk | None:
         """Return the next frame to write; none if nothing waits.

@@ -161,6 +161,20 @@ class OutgoingQueue:
             self.counters.count_frame(frame)
         return frame, start, end
 
+    def give_up(self, call_id: int) -> int:
+        """Throw a call away of which a part is on its way.
+
+        Returns:
+            Size of the message, which must be aborted; 0 if that call has not begun, or was sent.
+        """
+        frame = self._begun
+        if frame is None or frame.id != call_id:
+            return 0
+        size = len(frame.payload)
+        self._begun, self.sent = None, 0
+        self._count(-size)
+        return size
+
     def withdraw(self, call_id: int) -> bool:
         """Take a call back that has not begun; false if there is none."""
         before = self._waiting.bytes

@@ -184,8 +184,10 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self.resume_sending()
 
     def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
-        """Take a call back that has not begun to be sent."""
-        return self._lanes.withdraw(queue, call_id)
+        """Take a call back of which a part at least has not been sent."""
+        withdrawn = self._lanes.withdraw(queue, call_id)
+        self.resume_sending()
+        return withdrawn
 
     def clear(self, queue: OutgoingQueue) -> None:
         """Throw away what waits on a channel."""

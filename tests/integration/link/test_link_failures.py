@@ -301,6 +301,33 @@ async def test_small_messages_overtake_a_large_one(rig: Rig) -> None:
     assert len(messages[5]) == 10_000_000
 
 
+async def test_rest_of_a_call_that_timed_out_is_not_sent(rig: Rig) -> None:
+    """What a slow peer has got of it is dropped, so that it is not carried out; the next call follows."""
+    robot = rig.party("a", await rig.hub())
+    await rig.listen(robot, "unix")
+    await robot.apply(
+        {"i1": SERVICE_OUT[0]},
+        [LinkSpec(id="S", peer="user/s", token="secret", dial=False)],
+        [ConnectionSpec(id=1, link="S", interface="i1", peer_interface="x")],
+    )
+    slow = await Stalled.dial(robot.address, "S", [1])
+    await robot.connected(1)
+    port = robot.fakes["i1"].port
+    with pytest.raises(CallTimeoutError):
+        await port.call(bytes(10_000_000), timeout=0.1)
+    call = asyncio.ensure_future(port.call(b"next", timeout=60.0))
+    reader = FrameReader(LinkLimits())
+    calls: list[Frame] = []
+    while not calls:
+        calls += [frame for frame in await slow.read_frames(reader) if frame.type is FrameType.CALL]
+    assert [bytes(frame.payload) for frame in calls] == [b"next"]
+    answer = encode(Frame(FrameType.REPLY, 1, calls[0].id, 0, b"answer"))
+    await asyncio.get_running_loop().sock_sendall(slow.sock, answer)
+    assert await call == b"answer"
+    assert [channel.waiting_bytes for channel in robot.endpoint._channels.of(1)] == [0]
+    slow.sock.close()
+
+
 async def test_dead_machine_is_noticed_on_tcp(rig: Rig) -> None:
     b = rig.party("b", await rig.hub(heartbeat=0.05, silence=0.2))
     await rig.listen(b, "tcp")

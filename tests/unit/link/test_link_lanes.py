@@ -245,6 +245,33 @@ def test_clearing_a_channel_mid_message_tells_the_peer() -> None:
     assert not lanes
 
 
+def test_call_that_has_begun_is_withdrawn() -> None:
+    """The peer is told that the rest does not come; what waits behind it follows."""
+    lanes = Lanes(LIMITS)
+    queue = service(1)
+    lanes.add(queue, Frame(FrameType.CALL, 1, 7, 0, bytes(300_000)))
+    lanes.add(queue, Frame(FrameType.CALL, 1, 8, 0, bytes(200_000)))
+    reader = FrameReader(LIMITS)
+    assert reader.feed(b"".join(lanes.next() or ())) == []
+    assert not lanes.withdraw(queue, 9)
+    assert lanes.withdraw(queue, 7)
+    assert not lanes.withdraw(queue, 7)
+    chunks = list(iter(lanes.next, None))
+    assert [chunk[0][0] for chunk in chunks] == [FrameType.ABORT, FrameType.CALL, FrameType.FRAGMENT]
+    (call,) = (frame for chunk in chunks for frame in reader.feed(b"".join(chunk)))
+    assert call.id == 8
+    assert queue.waiting_bytes == lanes._begun_bytes == reader.held_bytes == 0
+
+
+def test_call_that_was_sent_is_not_withdrawn() -> None:
+    lanes = Lanes(LIMITS)
+    queue = service(1)
+    lanes.add(queue, Frame(FrameType.CALL, 1, 7, 0, bytes(300_000)))
+    drain(lanes)
+    assert not lanes.withdraw(queue, 7)
+    assert not lanes
+
+
 def test_no_more_is_begun_than_the_peer_accepts() -> None:
     lanes = Lanes(LinkLimits(unfinished_bytes=400_000))
     for channel in (1, 2, 3):
