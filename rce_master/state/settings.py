@@ -54,6 +54,9 @@ class StateSettings:
     has a record of its own, and a change costs what it changes: the limit bounds memory only."""
     max_connections: int = 24_000
     """Of one endpoint."""
+    max_link_connections: int = 4096
+    """Of two endpoints with each other, at most as many as their link takes
+    (:attr:`rce.link.settings.LinkLimits.max_channels`): it ends whenever there is one more."""
     max_user_interfaces: int = 50_000
     """Of all endpoints of one user. The master keeps about 2 kB for each; what they take where they are in
     use counts there, for the container or for the user's robots."""

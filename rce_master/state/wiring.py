@@ -87,6 +87,9 @@ def connect(tx: Transaction, command: Connect) -> None:
     if _connection(tx, pair) is not None:
         return
     _check_pair(tx, pair)
+    limit = tx.settings.max_link_connections
+    if link is not None and tx.tables.connections.count("link", link.id) >= limit:
+        raise LimitReachedError(f"{pair.a.tag!r} and {pair.b.tag!r} have {limit} connections already")
     if link is None:
         number = tx.next_number("link")
         link = Link(id=f"link{number}", a=pair.a.id, b=pair.b.id, token=tx.new_token())

@@ -53,6 +53,7 @@ LIMITS = StateSettings(
     placement_timeout=1,
     max_containers=3,
     max_connections=6,
+    max_link_connections=4,
 )
 
 

@@ -7,6 +7,7 @@ import itertools
 import pytest
 from support.master_world import World
 
+from rce.link.settings import LinkLimits
 from rce.model.specs import ParameterSpec, ParameterValue
 from rce_master.exceptions import (
     ConflictError,
@@ -229,6 +230,26 @@ def test_a_refused_command_changes_nothing_and_uses_no_number() -> None:
     with pytest.raises(RefusedError):
         world.login("rob")
     assert {table.name: list(table) for table in world.state.tables.all} == before
+
+
+def test_connections_of_two_endpoints_are_limited() -> None:
+    """Their link takes no more; what is there is accepted, and other endpoints have links of their own."""
+    world = World(StateSettings(max_link_connections=2))
+    world.wired()
+    world.container("other")
+    for path in ("c/in2", "c/in3", "other/in"):
+        world.interface(path, "PublisherInterface")
+    world.connect("rob/out", "c/in2")
+    with pytest.raises(LimitReachedError, match="'c' and 'rob' have 2 connections already"):
+        world.connect("rob/out", "c/in3")
+    world.connect("rob/out", "c/in2")
+    world.connect("rob/out", "other/in")
+    world.do(commands.Disconnect(user="anna", tag_a="rob/out", tag_b="c/in"))
+    world.connect("rob/out", "c/in3")
+
+
+def test_a_link_takes_all_connections_that_the_master_allows() -> None:
+    assert StateSettings().max_link_connections <= LinkLimits().max_channels
 
 
 def test_connection_ids_and_links_are_never_used_again(world: World) -> None:
