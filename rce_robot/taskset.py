@@ -165,8 +165,7 @@ class RobotTaskSet:
             case Probe():
                 self._probe(EndpointId.parse(message.id))
             case (
-                Welcome()
-                | Refused()
+                Refused()
                 | LoginReply()
                 | ClientReply()
                 | ReadLog()

@@ -129,10 +129,6 @@ class BoundedQueue(Generic[T]):
         """Return the oldest item, None if the queue is empty."""
         return self._entries[0][0] if self._entries else None
 
-    def has_kept(self, key: Hashable) -> bool:
-        """Return whether an item with this key is kept."""
-        return key in self._kept
-
     def put(self, item: T, size: int, key: Hashable = None) -> bool:
         """Append an item, and drop the oldest ones that no longer fit.
 

@@ -200,13 +200,8 @@ class ProtocolStream:
         return cls(DOWNWARD, limits, single=single)
 
     @property
-    def pending(self) -> int:
-        """Count of incomplete messages and unclaimed binary values."""
-        return len(self._assembler)
-
-    @property
     def pending_bytes(self) -> int:
-        """Bytes kept for them."""
+        """Bytes kept of incomplete messages and unclaimed binary values."""
         return self._assembler.pending_bytes
 
     @property

@@ -156,13 +156,6 @@ class Core:
         self._perform(self.graph.forget_node(name))
         return known
 
-    def forget_uri(self, uri: str) -> bool:
-        """Unregister all nodes whose slave API is ``uri``; return whether anything was registered."""
-        found = [name for name, node_uri in self.graph.nodes.items() if node_uri == uri]
-        for name in found:
-            self.forget_node(name)
-        return bool(found)
-
     def set_param(self, name: str, value: Any) -> None:
         """Set a parameter or namespace by its global name."""
         self._perform(self.graph.set_parameter(name, value))

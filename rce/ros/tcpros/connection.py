@@ -54,7 +54,6 @@ class Connection(asyncio.BufferedProtocol):
         owner: Takes the frames; may be exchanged, as when the header told what the connection is for.
         full: Whether too much waits to be sent already. Writing is still possible, but should wait.
         bytes_in: Bytes of frames received, without their heads.
-        frames_in: Frames received, the connection header among them.
         gone: Set when the socket is closed.
     """
 
@@ -71,7 +70,6 @@ class Connection(asyncio.BufferedProtocol):
         self.owner = owner
         self.full = False
         self.bytes_in = 0
-        self.frames_in = 0
         self.gone = asyncio.Event()
         self.reader = FrameReader(scratch, limit=MAX_HEADER)
         self._siblings = siblings
@@ -204,7 +202,6 @@ class Connection(asyncio.BufferedProtocol):
 
     def _hand_over(self, payload: bytes) -> None:
         self.bytes_in += len(payload)
-        self.frames_in += 1
         self.owner.frame_received(self, payload)
 
     @staticmethod

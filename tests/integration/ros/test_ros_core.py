@@ -123,8 +123,8 @@ async def test_a_dead_node_stalls_nobody(core: Core, make_node: MakeNode) -> Non
             subscriber = await b.subscribe("t", STRING)
             await a.advertise("t", STRING)
             await subscriber.wait_for_publishers(timeout=0.9 * CALL_TIMEOUT)
-            assert core.forget_uri(refusing_uri)
-            assert not core.forget_uri(refusing_uri)
+            assert core.forget_node("/refusing")
+            assert not core.forget_node("/refusing")
             assert core.forget_node("/silent")
             assert core.graph.subscribers("/t") == {"/b": b.uri}
 
@@ -332,7 +332,7 @@ async def test_a_large_graph(core: Core) -> None:
         assert len(known) == 2 * nodes + parameters + 4  # and the core's own
         assert (await rpc.call(core.uri, "getParam", ("/x", "/many"), timeout=120))[2] == many
         for number in range(nodes):
-            assert core.forget_uri(f"http://127.0.0.1:1/{number}")
+            assert core.forget_node(f"/n{number}")
         assert core.graph.nodes == core.graph.topic_types == {}
 
 

@@ -56,7 +56,7 @@ def test_serialized_message_in_either_order(text_first: bool) -> None:
     assert isinstance(message, DataMessage)
     assert isinstance(message.msg, memoryview)
     assert (bytes(message.msg), message.msg_id) == (b"payload", "7")
-    assert (stream.pending, stream.pending_bytes, stream.next_deadline) == (0, 0, None)
+    assert (len(stream._assembler), stream.pending_bytes, stream.next_deadline) == (0, 0, None)
 
 
 def test_binary_value_is_not_copied() -> None:
@@ -179,7 +179,7 @@ def test_wrong_reference_refuses_the_message(msg: object, problem: str) -> None:
     (fault,) = stream.feed(starred(msg), 0.0)
     assert isinstance(fault, Fault)
     assert problem in fault.text
-    assert stream.pending == 0
+    assert len(stream._assembler) == 0
 
 
 @pytest.mark.parametrize("rest", [{}, {"k" * 100_000: 1}], ids=["no id", "two values"])
@@ -222,7 +222,7 @@ def test_incomplete_expires_after_a_minute_and_is_reported() -> None:
     assert stream.next_deadline == 70.0
     (fault,) = stream.expire(70.0)
     assert fault == Fault(f"no message asked for binary value {'a' * 32} (3 bytes) within 60 s; dropped")
-    assert (stream.pending, stream.pending_bytes) == (0, 0)
+    assert (len(stream._assembler), stream.pending_bytes) == (0, 0)
     assert stream.feed(binary(OTHER, b"late"), 71.0) == []  # nobody waits for it any more
 
 
@@ -234,7 +234,7 @@ def test_too_many_incomplete_drop_the_oldest() -> None:
     assert fault == Fault(
         "1 of 1 binary values of a message did not come and too much is incomplete; the oldest was dropped"
     )
-    assert stream.pending == 2
+    assert len(stream._assembler) == 2
     assert plain(stream.feed(binary(OTHER, b"y"), 0.0)[0]) == {"k": b"y"}
 
 
@@ -339,7 +339,7 @@ def test_frames_of_many_messages_in_any_order(sent: list[Any], random: Random) -
     random.shuffle(frames)
     got = [plain(event) for frame in frames for event in stream.feed(frame, 0.0)]
     assert Counter(map(repr, map(ordered, got))) == Counter(map(repr, map(ordered, sent)))
-    assert (stream.pending, stream.pending_bytes) == (0, 0)
+    assert (len(stream._assembler), stream.pending_bytes) == (0, 0)
 
 
 def ordered(value: object) -> Any:
@@ -376,10 +376,10 @@ def test_no_frame_raises_and_memory_stays_bounded(frames: list[Frame]) -> None:
     for now, frame in enumerate(frames):
         for event in [*stream.feed(frame, float(now)), *stream.expire(float(now))]:
             assert isinstance(event, DataMessage | Fault)
-        assert stream.pending <= 5
+        assert len(stream._assembler) <= 5
         assert 0 <= stream.pending_bytes <= 2000
     stream.expire(1e9)
-    assert (stream.pending, stream.pending_bytes) == (0, 0)
+    assert (len(stream._assembler), stream.pending_bytes) == (0, 0)
 
 
 def serialized(id_: str, **more: object) -> str:
@@ -415,7 +415,7 @@ def test_serialized_message_expires_and_leaves_nothing() -> None:
     stream = ProtocolStream.for_engine()
     stream.feed(serialized(ID), 0.0)
     assert len(stream.expire(60.0)) == 1
-    assert (stream.pending, stream.pending_bytes) == (0, 0)
+    assert (len(stream._assembler), stream.pending_bytes) == (0, 0)
 
 
 def test_serialized_message_with_another_binary_beside_it() -> None:

@@ -28,7 +28,7 @@ def feed(frame: bytes, limits: Limits = DEFAULT_LIMITS) -> Event:
     """What the engine makes of the frame of a client that agreed on one frame; nothing is left of it."""
     stream = ProtocolStream.for_engine(limits, single=True)
     (event,) = stream.feed(frame, 0.0)
-    assert (stream.pending, stream.pending_bytes, stream.next_deadline) == (0, 0, None)
+    assert (len(stream._assembler), stream.pending_bytes, stream.next_deadline) == (0, 0, None)
     return event
 
 
