@@ -69,15 +69,20 @@ def find_circle(start: str, after: Mapping[str, Sequence[str]]) -> list[str]:
     Returns:
         The tags on the cycle, ``start`` first and last; empty without a cycle.
     """
-    ways = [[start, tag] for tag in after.get(start, ())]
+    way = [start]
+    following = [reversed(after.get(start, ()))]  # what is left to follow from each tag of the way
     seen: set[str] = set()
-    while ways:
-        way = ways.pop()
-        if way[-1] == start:
-            return way
-        if way[-1] not in seen:
-            seen.add(way[-1])
-            ways += [[*way, tag] for tag in after.get(way[-1], ())]
+    while way:
+        tag = next(following[-1], None)
+        if tag is None:
+            way.pop()
+            following.pop()
+        elif tag == start:
+            return [*way, tag]
+        elif tag in after and tag not in seen:
+            seen.add(tag)
+            way.append(tag)
+            following.append(reversed(after[tag]))
     return []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import pairwise
 from typing import Any
 
@@ -114,3 +115,32 @@ def test_a_circle_is_a_way_back(after: dict[str, list[str]], start: str) -> None
         for _ in "abcd":
             reached |= {far for near in reached for far in after.get(near, ())}
         assert start not in reached
+
+
+@pytest.mark.parametrize(
+    ("after", "circle"),
+    [
+        ({"a": "bc", "b": "d", "c": "a", "d": "a"}, "aca"),
+        ({"a": "bc", "b": "d", "c": "be", "d": "a", "e": "f"}, "acbda"),
+        ({"a": "bd", "b": "c", "c": "a", "d": "bd"}, "adbca"),
+        ({"a": "ab"}, "aa"),
+        ({"a": "b", "b": "cb", "c": "b"}, ""),
+        ({}, ""),
+    ],
+)
+def test_a_circle_is_found_from_the_last_of_after(after: dict[str, str], circle: str) -> None:
+    assert find_circle("a", after) == list(circle)
+
+
+def test_a_long_way_with_many_names_takes_little_memory() -> None:
+    count, others = 499, [f"other{number}" for number in range(999)]
+    after = {f"n{number}": [*others, f"n{number + 1}"] for number in range(count)}
+    tracemalloc.start()
+    try:
+        assert find_circle("n0", after) == []
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 20 << 20
+    after[f"n{count}"] = ["n0"]
+    assert len(find_circle("n0", after)) == count + 2
