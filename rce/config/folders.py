@@ -29,10 +29,11 @@ def default_state_dir() -> Path:
 
 
 def master_folder(state_dir: Path) -> Path:
-    """Return the folder of the master's state in the folder that ``rce-master --state-dir`` names.
+    """Return the folder of the master's state in the folder that ``rce-master`` is given.
 
     That is the folder itself, or the folder ``master`` in it where only that holds a state: the named folder
-    is then that of an engine (``rce up --state-dir``), or ``rce user add --state-dir`` made it.
+    is then that of an engine (``rce up --state-dir``), or ``rce user add --state-dir`` or ``rce master copy``
+    made it.
     """
     inner = state_dir / MASTER_FOLDER
     only_inner = (inner / STORE_FILE).exists() and not (state_dir / STORE_FILE).exists()

@@ -155,7 +155,7 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         """The folder of the master's state; with etcd, of what remains on its machine."""
         address = read_store_address(self.master.store)
         if isinstance(address, SqliteAddress) and address.folder is not None:
-            return address.folder
+            return master_folder(address.folder)
         if self.master.state_dir is not None:
             return master_folder(self.master.state_dir)
         return self.state_dir / MASTER_FOLDER

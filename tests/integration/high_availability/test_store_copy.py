@@ -10,6 +10,7 @@ import pytest
 from support.etcd import cluster
 from support.master_program import rce
 
+from rce.config import STORE_FILE, EngineSettings, MasterSettings
 from rce_master.state.tables import Tables
 from rce_master.state.user_records import UserPackage
 from rce_master.store import Row, SqliteStore
@@ -59,6 +60,8 @@ async def test_a_state_is_copied_to_etcd_and_back(tmp_path: Path) -> None:
         assert "--from must be sqlite:FOLDER or etcd://" in told
 
         await rce(tmp_path, "master", "copy", "--from", there, "--to", "sqlite:back")
+        settings = EngineSettings(master=MasterSettings(store=f"sqlite:{tmp_path}/back"))
+        assert (settings.master_state / STORE_FILE).exists(), "a master with this store begins with it"
         back = await SqliteStore.open(tmp_path / "back" / "master")
         assert {table: rows for table, rows in (await back.load()).items() if rows} == copied
         assert await back.begin_term() > await in_etcd.begin_term()

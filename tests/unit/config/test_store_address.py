@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from rce.config import EngineSettings, EtcdAddress, MasterSettings, SqliteAddress, read_store_address
+from rce.config import (
+    MASTER_FOLDER,
+    STORE_FILE,
+    EngineSettings,
+    EtcdAddress,
+    MasterSettings,
+    SqliteAddress,
+    read_store_address,
+)
 
 
 def test_an_address_of_etcd_has_endpoints_prefix_and_tls() -> None:
@@ -22,6 +30,18 @@ def test_an_address_of_sqlite_is_a_folder() -> None:
     assert settings.master_state == Path("/var/lib/x")
     etcd = EngineSettings(state_dir=Path("/s"), master=MasterSettings(store="etcd://one"))
     assert etcd.master_state == Path("/s/master")
+
+
+def test_a_state_in_a_named_folder_is_where_commands_made_it(tmp_path: Path) -> None:
+    """``rce master copy --to sqlite:FOLDER`` makes a new state in ``FOLDER/master``."""
+    settings = EngineSettings(master=MasterSettings(store=f"sqlite:{tmp_path}"))
+    assert settings.master_state == tmp_path
+    inner = tmp_path / MASTER_FOLDER
+    inner.mkdir()
+    (inner / STORE_FILE).touch()
+    assert settings.master_state == inner
+    (tmp_path / STORE_FILE).touch()
+    assert settings.master_state == tmp_path
 
 
 @pytest.mark.parametrize(
