@@ -19,10 +19,10 @@ from rce.control.snapshots import MAX_MANIFEST, Kept, Offer, Wanted, decode_mani
 from rce_master.exceptions import EndedError, FencedError, MasterError, StoreError
 from rce_master.reports import REPEAT_S
 from rce_master.snapshots.needed import NeededSnapshots
-from rce_master.state import commands
+from rce_master.state import commands, volume_moves
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Collection, Iterator
+    from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterator
     from contextlib import AbstractAsyncContextManager
 
     from websockets.asyncio.server import ServerConnection
@@ -50,6 +50,8 @@ CONTENT_S = 120.0
 """Seconds that it may take to send a content after the one before it, or to receive an answer."""
 _SLACK = 16 << 20
 """Bytes that a snapshot may have beyond the size of its volume: sizes of folders are only watched."""
+_SPREAD_AT_ONCE = 4
+"""Snapshots that are sent to the other masters at the same time."""
 _CLOSE_CODE = 1008
 
 
@@ -82,6 +84,7 @@ class SnapshotService:
         """Contents of snapshots that are being sent, or wait for being accepted."""
         self._lock = asyncio.Lock()
         """Held while contents are compared with what the state needs."""
+        self._spreading = asyncio.Semaphore(_SPREAD_AT_ONCE)
         self._dirty = asyncio.Event()
         state_service.listeners.append(self._note)
 
@@ -231,12 +234,18 @@ class SnapshotService:
                     kept = Kept(error=str(error))
             await self._say(socket, kept)
 
-    async def accept(self, process: str, message: VolumeSaved) -> None:
+    def accept(self, process: str, message: VolumeSaved) -> Coroutine[None, None, None]:
         """Note a snapshot that a task set has sent, once its contents are where they have to be.
+
+        The move that it belongs to is the one under way at this call: another one may begin before the
+        returned work is done.
 
         Args:
             process: Of the task set.
             message: What it says.
+
+        Returns:
+            The work.
         """
         taken = commands.SnapshotTaken(
             process=process,
@@ -245,10 +254,14 @@ class SnapshotService:
             is_last=message.is_last,
             snapshot=message.snapshot,
             taken=self._clock(),
+            since=volume_moves.phase_began(self._state_service.tables, message.volume),
             error=message.error,
         )
+        return self._accept(taken)
+
+    async def _accept(self, taken: commands.SnapshotTaken) -> None:
         try:
-            if not message.error:
+            if not taken.error:
                 await self._keep(taken)
                 return
         except (EndedError, FencedError):
@@ -274,8 +287,8 @@ class SnapshotService:
             async with self._lock:
                 await asyncio.to_thread(self._check, contents)
                 self._needed.add(taken.snapshot, contents)
-                async with self._spread(taken.snapshot, *contents):
-                    await self._state_service.submit(replace(taken, size=size))
+            async with self._spreading, self._spread(taken.snapshot, *contents):
+                await self._state_service.submit(replace(taken, size=size))
 
     def _read_manifest(self, sha256: str) -> tuple[int, set[str]]:
         """Return the size and the contents of a snapshot. Blocks.

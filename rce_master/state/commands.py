@@ -194,6 +194,8 @@ class SnapshotTaken(Struct, frozen=True, kw_only=True):
     """Bytes."""
     taken: float = 0.0
     """Seconds since 1970."""
+    since: float | None = None
+    """When the phase began in which the volume's move was as the report came; None: it did not move."""
     error: str = ""
 
 

@@ -102,6 +102,19 @@ def stopped(tx: Transaction, container: Container, move: VolumeMove) -> None:
     _advance(tx, move, VolumeMoveEvent.STOPPED)
 
 
+def phase_began(tables: Tables, volume: str) -> float | None:
+    """Return when the present phase of a volume's move began; None if it does not move.
+
+    Args:
+        tables: The tables.
+        volume: ``user/name``.
+    """
+    known = tables.volumes.get(volume)
+    container = None if known is None else volumes.holder_of(tables, known.user, known.name)
+    move = None if container is None else tables.volume_moves.get(container.id)
+    return None if move is None else move.since
+
+
 def snapshot_taken(tx: Transaction, command: SnapshotTaken) -> None:
     """Note a snapshot of a volume, or that it failed; one of another placement counts for nothing."""
     known = tx.tables.volumes.get(command.volume)
@@ -109,7 +122,13 @@ def snapshot_taken(tx: Transaction, command: SnapshotTaken) -> None:
         return
     container = volumes.holder_of(tx.tables, known.user, known.name)
     move = None if container is None else tx.tables.volume_moves.get(container.id)
-    is_awaited = command.is_last and move is not None and move.phase is VolumeMovePhase.SAVING
+    is_awaited = (
+        command.is_last
+        and move is not None
+        and move.phase is VolumeMovePhase.SAVING
+        and move.since
+        == command.since  # an answer to the order of an earlier move lacks what was written since
+    )
     if command.error:
         if is_awaited and move is not None:
             give_up(tx, move, f"volume {known.name!r} could not be saved: {command.error}")

@@ -10,6 +10,7 @@ from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.lifecycle import VolumeMovePhase
 from rce_master.state.settings import StateSettings
+from rce_master.state.volume_moves import phase_began
 from rce_master.state.volume_records import UserVolume
 from support.master_world import World
 
@@ -68,7 +69,16 @@ class Moving(World):
     def gone(self, process: str = "c1") -> None:
         self.do(commands.EndpointGone(process=process, id="anna/c"))
 
-    def saved(self, snapshot: str = NEW, *, error: str = "", is_last: bool = True, process: str = "") -> None:
+    def saved(
+        self,
+        snapshot: str = NEW,
+        *,
+        error: str = "",
+        is_last: bool = True,
+        process: str = "",
+        since: float | None = None,
+    ) -> None:
+        """A snapshot is accepted; it was reported now, or in the phase that began ``since``."""
         command = commands.SnapshotTaken(
             process=process or self.volume.process,
             volume="anna/journal",
@@ -77,6 +87,7 @@ class Moving(World):
             snapshot="" if error else snapshot,
             size=7,
             taken=5.0,
+            since=phase_began(self.state.tables, "anna/journal") if since is None else since,
             error=error,
         )
         self.do(command)

@@ -140,7 +140,7 @@ async def test_contents_stay_while_a_snapshot_waits_for_its_turn(kept: Kept) -> 
         await upload.finish()
     await until(lambda: not kept.service._coming, what="the end of the connection is noted")
     (kept.folder / "incoming").mkdir(exist_ok=True)
-    await kept.service._lock.acquire()  # another snapshot is copied to the other masters
+    await kept.service._lock.acquire()  # contents are being compared
     async with kept.sweeping():
         await until(lambda: not (kept.folder / "incoming").exists(), what="the sweep waits")
         accepting = asyncio.create_task(kept.accept())

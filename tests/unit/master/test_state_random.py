@@ -21,6 +21,7 @@ from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.settings import StateSettings
 from rce_master.state.user_records import User, UserRole
+from rce_master.state.volume_moves import phase_began
 from rce_master.state.volumes import volumes_of
 
 USERS = st.sampled_from(["ann", "bob"])
@@ -237,8 +238,8 @@ class Histories(RuleBasedStateMachine):
         for removal in list(self.state.tables.volume_removals)[: 1 if first else None]:
             self.do(commands.VolumeRemoved(process=removal.process, volume=removal.volume))
 
-    @rule(fails=st.booleans(), is_last=st.booleans())
-    def snapshots_are_taken(self, fails: bool, is_last: bool) -> None:
+    @rule(fails=st.booleans(), is_last=st.booleans(), late=st.booleans())
+    def snapshots_are_taken(self, fails: bool, is_last: bool, late: bool) -> None:
         for known in list(self.state.tables.volumes):
             if known.process:
                 command = commands.SnapshotTaken(
@@ -246,6 +247,7 @@ class Histories(RuleBasedStateMachine):
                     volume=known.id,
                     placement=known.placement,
                     is_last=is_last,
+                    since=None if late else phase_began(self.state.tables, known.id),
                     snapshot="" if fails else "5" * 64,
                     error="the disk is full" if fails else "",
                 )

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 from support.master_world import World
 from support.moving_volumes import JOURNAL, NEW, OLD, SIZE, Moving
 
 from rce.control import SNAPSHOTS, EndpointState, EndpointStatus, RestoreVolume, SaveVolume
+from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind, VolumeSaved
 from rce.model import Network
-from rce.model.specs import ResourceChanges
+from rce.model.specs import ResourceChanges, Resources
 from rce_master.exceptions import ConflictError, NoRoomError
+from rce_master.packages.contents import ContentStore
+from rce_master.snapshots.service import SnapshotService
 from rce_master.state import commands
 from rce_master.state.lifecycle import VolumeMovePhase
+from rce_master.state.volume_moves import phase_began
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.master_cloud import Cloud
 
 PHASES = [VolumeMovePhase.STOPPING, VolumeMovePhase.SAVING, VolumeMovePhase.RESTORING]
 
@@ -153,6 +164,62 @@ def test_answers_of_others_count_for_nothing() -> None:
 
 
 FAILED = EndpointStatus(id="anna/c", revision=1, state=EndpointState.FAILED, detail="no such package")
+
+
+@pytest.mark.parametrize("error", ["", "the master's disk is full"])
+def test_a_late_answer_to_an_earlier_move_counts_for_nothing(error: str) -> None:
+    """Its files lack what the container has written since."""
+    world = Moving()
+    world.do(commands.SetDraining(machine="m1", draining=True))
+    world.gone()
+    earlier = phase_began(world.state.tables, "anna/journal")
+    world.do(commands.SetDraining(machine="m1", draining=False))
+    world.run("c", "c1")
+    world.tick(1)
+    world.do(commands.SetDraining(machine="m1", draining=True))
+    world.gone()
+    world.saved(OLD, error=error, since=earlier)
+    assert world.phase_of_move() is VolumeMovePhase.SAVING
+    world.saved()
+    assert world.orders("c2") == [RestoreVolume(volume="anna/journal", placement=2, snapshot=NEW, size=SIZE)]
+
+
+async def test_an_answer_belongs_to_the_move_that_it_found(cloud: Cloud, tmp_path: Path) -> None:
+    """The same, while the master is busy with the answer."""
+    state_service = cloud.state_service
+
+    async def do(*wanted: commands.Command) -> None:
+        assert not any(await state_service.submit_all(list(wanted)))
+
+    def phase() -> VolumeMovePhase | None:
+        move = state_service.tables.volume_moves.get("anna/c")
+        return None if move is None else move.phase
+
+    for number in (1, 2):
+        machine = MachineInfo(name=f"m{number}", slots=4, volumes="image")
+        hello = Hello(
+            version=CONTROL_VERSION,
+            kind=TaskSetKind.CONTAINER,
+            process=f"c{number}",
+            machine=machine,
+            features=(SNAPSHOTS,),
+        )
+        await cloud.control_handler.on_hello(cloud.containers(hello.process), hello)
+        if number == 1:
+            await do(commands.CreateContainer(user="anna", tag="c", resources=Resources(volumes=(JOURNAL,))))
+    drain, undo = (commands.SetDraining(machine="m1", draining=wanted) for wanted in (True, False))
+    gone = commands.EndpointGone(process="c1", id="anna/c")
+    service = SnapshotService(state_service, ContentStore(tmp_path))
+    answer = VolumeSaved(volume="anna/journal", placement=1, is_last=True, error="the disk is full")
+    await do(drain, gone)
+    late = service.accept("c1", answer)
+    await do(undo)
+    await do(drain, gone)
+    assert phase() is VolumeMovePhase.SAVING
+    await late
+    assert phase() is VolumeMovePhase.SAVING
+    await service.accept("c1", answer)
+    assert phase() is None
 
 
 def returned() -> Moving:
