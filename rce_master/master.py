@@ -27,7 +27,7 @@ from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
 from rce_master.http.entry import Entry, refusal
-from rce_master.http.forwarded import PURPOSE, ForwardingKey
+from rce_master.http.forwarded import ForwardingKey
 from rce_master.http.routes import Services
 from rce_master.node_states import NodeStateServer
 from rce_master.packages.contents import ARCHIVES, ARCHIVES_PATH, ContentStore
@@ -200,7 +200,7 @@ class Master:
             audit=audit,
             answers=Answers(state_service.tables, self._secret.derive(ANSWERS_PURPOSE), time.time),
             fence=self._fence,
-            forwarding=ForwardingKey(self._secret.derive(PURPOSE)),
+            forwarding=ForwardingKey(self._secret),
             drains=self._drains,
             other_audits=self._audits,
         )

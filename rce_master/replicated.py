@@ -21,14 +21,13 @@ from rce.web.server import HttpServer
 from rce_master.audit import AUDIT
 from rce_master.exceptions import FencedError, MasterError
 from rce_master.follower import StateFollower
-from rce_master.http.forwarded import PURPOSE, ForwardingKey
+from rce_master.http.forwarded import ForwardingKey
 from rce_master.http.probe import Probe
 from rce_master.leadership import LeaseSettings
 from rce_master.leadership.drains import MasterDrains
 from rce_master.leadership.engine_mark import EngineMark
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.leadership.registry import MasterRegistry
-from rce_master.leadership.request_key import PURPOSE as REQUEST_PURPOSE
 from rce_master.leadership.request_key import RequestKey
 from rce_master.leadership.standby_client import CONNECT_S, StandbyClient
 from rce_master.master import Master
@@ -146,7 +145,7 @@ class ReplicatedMaster:
         settings = self._settings
         for_clients = settings.tls.for_clients()
         names = ServerNames(settings.bind, settings.names)
-        key = RequestKey(self._secret.derive(REQUEST_PURPOSE))
+        key = RequestKey(self._secret)
         check = LeaderCheck(key, keeper.newest_term)
         packages = ContentStore(settings.state_dir / ARCHIVES, noun="package")
         snapshots = ContentStore(settings.state_dir / SNAPSHOTS, noun=SNAPSHOT)
@@ -215,7 +214,7 @@ class ReplicatedMaster:
     def _forwarder(self) -> Forwarder:
         from rce_master.http.forward import Forwarder  # loads aiohttp
 
-        key = ForwardingKey(self._secret.derive(PURPOSE))
+        key = ForwardingKey(self._secret)
         return Forwarder(key, TrustedProxies(self._settings.trusted_proxies), self._masters_tls())
 
     def _masters_tls(self) -> Context | None:

@@ -18,7 +18,7 @@ from rce.config.exceptions import SecretError
 from rce.config.folders import run_dir
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +65,27 @@ class Secret:
         """Derive a key from each secret that is accepted, the current one first."""
         return (_derive(self._text, purpose),)
 
+    def sign(self, purpose: str, text: str) -> str:
+        """Return the proof that a program which knows the secret wrote a text.
+
+        It has a MAC for each secret that is accepted: another machine may not have the current one yet.
+
+        Args:
+            purpose: Of the text: a proof for one purpose proves nothing for another.
+            text: What is signed.
+        """
+        return ",".join(_macs(self.derive_all(purpose), text))
+
+    def has_signed(self, purpose: str, text: str, proof: str) -> bool:
+        """Tell whether a proof is of :meth:`sign`, with at least one secret that is accepted here."""
+        given = proof.encode("utf-8", "surrogateescape").split(b",")
+        found = [
+            hmac.compare_digest(mac.encode(), one)
+            for mac in _macs(self.derive_all(purpose), text)
+            for one in given
+        ]
+        return any(found)
+
     def __eq__(self, other: object) -> bool:
         return self.matches(other._text) if isinstance(other, Secret) else NotImplemented
 
@@ -79,6 +100,10 @@ class Secret:
 
 def _derive(text: str, purpose: str) -> bytes:
     return hmac.digest(text.encode(), f"rce {purpose}".encode(), "sha256")
+
+
+def _macs(keys: Iterable[bytes], text: str) -> list[str]:
+    return [hmac.digest(key, text.encode("utf-8", "surrogateescape"), "sha256").hex() for key in keys]
 
 
 class SecretFile(Secret):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import hmac
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rce.config import Secret
 
 HEADER = "RCE-Forwarded"
-"""``ADDRESS TERM MAC``, of the client and of the leader to whom the request is sent."""
+"""``ADDRESS TERM PROOF``, of the client and of the leader to whom the request is sent."""
 PURPOSE = "forwarded requests"
-"""Of the key that is derived from the engine's secret."""
+"""Of the proof."""
 
 
 class ForwardingKey:
@@ -17,11 +20,11 @@ class ForwardingKey:
     could use the request's token too.
 
     Args:
-        key: Known to the masters only.
+        secret: The engine's, which may change.
     """
 
-    def __init__(self, key: bytes) -> None:
-        self._key = key
+    def __init__(self, secret: Secret) -> None:
+        self._secret = secret
 
     def sign(self, address: str, term: int) -> str:
         """Return the header's value.
@@ -31,17 +34,14 @@ class ForwardingKey:
             term: The leader's.
         """
         signed = f"{address or '-'} {term}"
-        return f"{signed} {self._mac(signed)}"
+        return f"{signed} {self._secret.sign(PURPOSE, signed)}"
 
     def read(self, value: str, term: int) -> str | None:
         """Return the client's address, or None if no stand-by wrote the value for this term."""
-        signed, _, mac = value.rpartition(" ")
-        if not hmac.compare_digest(self._mac(signed).encode(), mac.encode("utf-8", "surrogateescape")):
+        signed, _, proof = value.rpartition(" ")
+        if not self._secret.has_signed(PURPOSE, signed, proof):
             return None
         address, _, of = signed.partition(" ")
         if of != str(term):
             return None
         return "" if address == "-" else address
-
-    def _mac(self, text: str) -> str:
-        return hmac.digest(self._key, text.encode("utf-8", "surrogateescape"), "sha256").hex()

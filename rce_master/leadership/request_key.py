@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import hmac
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rce.config import Secret
 
 HEADER = "RCE-Master"
-"""``TERM MAC``, of the method, the path with its query, and the term of the leader that asks."""
+"""``TERM PROOF``, of the method, the path with its query, and the term of the leader that asks."""
 PURPOSE = "archives between masters"
-"""Of the key that is derived from the engine's secret; masters of several releases use the same."""
+"""Of the proof; masters of several releases use the same."""
 
 
 class RequestKey:
@@ -18,24 +21,21 @@ class RequestKey:
     or give the same records of the audit log once more.
 
     Args:
-        key: Known to the masters only.
+        secret: The engine's, which may change.
     """
 
-    def __init__(self, key: bytes) -> None:
-        self._key = key
+    def __init__(self, secret: Secret) -> None:
+        self._secret = secret
 
     def sign(self, method: str, path: str, term: int) -> str:
         """Return the header's value."""
-        return f"{term} {self._mac(method, path, str(term))}"
+        return f"{term} {self._secret.sign(PURPOSE, _signed(method, path, str(term)))}"
 
     def read(self, value: str, method: str, path: str) -> int | None:
         """Return the term of the leader that asks, or None if no master wrote the value for this request."""
-        term, _, mac = value.partition(" ")
-        expected = self._mac(method, path, term)
-        if not hmac.compare_digest(expected.encode(), mac.encode("utf-8", "surrogateescape")):
-            return None
-        return int(term)
+        term, _, proof = value.partition(" ")
+        return int(term) if self._secret.has_signed(PURPOSE, _signed(method, path, term), proof) else None
 
-    def _mac(self, method: str, path: str, term: str) -> str:
-        text = f"{method} {path} {term}"
-        return hmac.digest(self._key, text.encode("utf-8", "surrogateescape"), "sha256").hex()
+
+def _signed(method: str, path: str, term: str) -> str:
+    return f"{method} {path} {term}"

@@ -18,6 +18,7 @@ from support.engine import until
 from support.ports import free_port
 
 from rce.aio.tasks import TaskScope, cancel_and_wait
+from rce.config import Secret
 from rce.control.snapshots import FileEntry, Manifest
 from rce_master.http.archives import ArchiveRoutes
 from rce_master.http.leader_check import LeaderCheck
@@ -37,7 +38,7 @@ from rce_master.store import MemoryStore
 from rce_master.store.etcd.layout import OtherMaster
 
 MANY = 20_000
-KEY = RequestKey(b"key")
+KEY = RequestKey(Secret("the secret of the masters"))
 
 
 def hashes(count: int, what: str = "needed") -> list[str]:

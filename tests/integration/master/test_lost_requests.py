@@ -13,12 +13,15 @@ from aiohttp.test_utils import TestServer
 from support.absent_masters import silent_master, unreachable_port
 from support.ports import free_port
 
+from rce.config import Secret
 from rce.guard import TrustedProxies
 from rce_master.cli.client import IDEMPOTENCY_KEY, ApiClient
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.http.forward import Forwarder, NotForwardedError
 from rce_master.http.forwarded import ForwardingKey
 from rce_master.store.etcd.layout import Leader
+
+FORWARDING = ForwardingKey(Secret("the secret of the masters"))
 
 
 @asynccontextmanager
@@ -65,7 +68,7 @@ async def test_another_master_is_not_asked_for_what_may_be_done(method: str) -> 
 
 @pytest.mark.parametrize(("method", "status"), [("DELETE", 502), ("PUT", 502), ("POST", 502), ("GET", 503)])
 async def test_a_stand_by_tells_that_a_request_may_be_done(method: str, status: int) -> None:
-    async with ending_master() as leader, Forwarder(ForwardingKey(b"k" * 32), TrustedProxies()) as forwarder:
+    async with ending_master() as leader, Forwarder(FORWARDING, TrustedProxies()) as forwarder:
 
         async def forward(request: web.Request) -> web.StreamResponse:
             try:
@@ -86,7 +89,7 @@ async def test_a_request_to_a_leader_that_vanished_ends_with_its_lead(method: st
     """Its machine was cut off: no connection breaks, and TCP would go on for many minutes."""
     async with (
         silent_master() as (leader, asked),
-        Forwarder(ForwardingKey(b"k" * 32), TrustedProxies()) as forwarder,
+        Forwarder(FORWARDING, TrustedProxies()) as forwarder,
     ):
 
         async def forward(request: web.Request) -> web.StreamResponse:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from rce.config import Secret
 from rce_master.http.forwarded import ForwardingKey
 
-KEY = ForwardingKey(b"k" * 32)
+KEY = ForwardingKey(Secret("k" * 32))
 
 
 @pytest.mark.parametrize("address", ["10.0.0.7", "2001:db8::1", ""])
@@ -23,7 +24,7 @@ def test_the_address_arrives(address: str) -> None:
         "10.0.0.7 4 00",
         "10.0.0.7 4 \udcff",
         KEY.sign("10.0.0.7", 3),
-        ForwardingKey(b"x" * 32).sign("10.0.0.7", 4),
+        ForwardingKey(Secret("x" * 32)).sign("10.0.0.7", 4),
         KEY.sign("10.0.0.7", 4).replace("10.0.0.7", "10.0.0.8"),
         KEY.sign("10.0.0.7", 3).replace(" 3 ", " 4 "),
     ],
