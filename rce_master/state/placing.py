@@ -73,15 +73,15 @@ def _is_admitted(tables: Tables, container: Container) -> bool:
 def place_waiting(tx: Transaction) -> None:
     """Place the unplaced containers that fit on a machine."""
     queue, rooms = tx.tables.queue, tx.tables.rooms
-    too_much: set[tuple[bool, Resources]] = set()
+    too_much: set[tuple[int | None, Resources]] = set()
     for look in queue.looks():
         if tx.is_out_of_work():
             return
         container = tx.tables.container(look.id)
         assert container is not None
         tx.spend(_LOOK)
-        # Rooms only fill up here: what found none finds none later.
-        hopeless = (look.among is None, container.resources)
+        # Rooms only fill up here: what found none finds none later, but the next pass offers other machines.
+        hopeless = (None if look.among is None else look.pass_number, container.resources)
         if hopeless in too_much:
             continue
         found = rooms.candidates(container.resources, _anywhere, among=look.among, most=1)

@@ -34,6 +34,8 @@ class Look(NamedTuple):
     id: str
     among: Collection[str] | None
     """The only machines that it has not been refused by, by process; None: it may be any."""
+    pass_number: int
+    """Of the pass, which offers the same machines to all that it looks at."""
 
 
 def group_key(container: Container) -> str:
@@ -70,6 +72,7 @@ class PlacementQueue:
         """Machines that are offered in this pass."""
         self._reached: int | None = None
         """Number of the last container of this pass; None: no pass is under way."""
+        self._pass_number = 0
         endpoints.watch(self._endpoint_changed)
         tombstones.watch(self._tombstone_changed)
         volume_removals.watch(self._removal_changed)
@@ -106,8 +109,9 @@ class PlacementQueue:
             if self._reached is None:
                 self._offered, self._gained = self._gained, {}
                 self._reached = 0
+                self._pass_number += 1
             for number, id_ in self._rest(self._reached):
-                yield Look(id_, None if id_ in self._unseen else self._offered)
+                yield Look(id_, None if id_ in self._unseen else self._offered, self._pass_number)
                 self._unseen.pop(id_, None)
                 self._reached = number
             self._reached = None

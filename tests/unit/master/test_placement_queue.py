@@ -66,6 +66,18 @@ def test_slices_keep_the_order_of_the_queue() -> None:
     assert places(world) == ["c1", "c2", "", ""]
 
 
+def test_a_machine_that_comes_during_a_pass_is_not_left_empty() -> None:
+    """What found no room in the pass that was under way finds it in the next one, of the same command."""
+    world = World(StateSettings(max_work=1000))
+    for number in range(10):
+        world.container(f"w{number}")
+    changes = world.container_set("c1", name="m1", slots=6)
+    assert changes.unfinished
+    assert 0 < places(world).count("c1") < 6
+    finish(world, world.container_set("c2", name="m2", slots=6))
+    assert places(world) == ["c1"] * 6 + ["c2"] * 4
+
+
 def test_settled_queue_is_not_looked_at(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     world.container_set("c1", slots=1)
     world.container("first")
