@@ -151,6 +151,8 @@ def tell_waiting(tx: Transaction) -> None:
         assert isinstance(live, ContainerLive)
         if tx.now - live.since < tx.settings.placement_timeout:
             continue
+        if live.id in tx.tables.volume_moves:
+            continue  # it has a machine, which restores its volumes, or tries that again soon
         if tx.is_out_of_work():
             return
         container = tx.tables.container(live.id)

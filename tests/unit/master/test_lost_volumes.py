@@ -87,6 +87,15 @@ def test_a_restore_that_fails_is_tried_again() -> None:
     assert world.runs_at("c2")
 
 
+def test_its_user_is_not_told_to_wait_for_a_machine() -> None:
+    world = Moving(KEPT)
+    world.saved(is_last=False)
+    lose(world)
+    changes = world.tick(world.state.settings.placement_timeout + 1)
+    assert world.phase_of_move() is VolumeMovePhase.RESTORING
+    assert (changes.notices, changes.events, world.stays) == ([], [], "")
+
+
 def test_both_machines_lost_one_after_the_other() -> None:
     world = Moving(KEPT)
     world.saved(is_last=False)
