@@ -125,8 +125,10 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
         BackupError: The copy is incomplete or was made by a newer program, or the folder already has state.
     """
     master = folders[MASTER]
+    aside: list[Path] = []
     with locked(master):
         there = [folder for folder in folders.values() if _holds_state(folder)]
+        there = [folder for folder in there if not _is_inside(folder, master)]  # they are moved with it
         if there and not replace:
             raise BackupError(f"there is state in {there[0]}; to move it aside, give --replace")
         try:
@@ -134,11 +136,17 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
                 found = extract(file, Path(name))
                 check_store(Path(name) / MASTER / FILE_NAME)
                 stamp = time.strftime("%Y%m%d-%H%M%S")
-                aside = [_move_aside(folder, stamp) for folder in there]
+                for folder in there:
+                    former = folder.with_name(f"{folder.name}.before-{stamp}")
+                    former.mkdir(mode=0o700)
+                    aside.append(former)
+                    _move_aside(folder, former)
                 for part, folder in folders.items():
                     _move(Path(name) / part, folder)
         except (OSError, tarfile.TarError) as error:
-            raise BackupError(f"cannot restore {file}: {error}") from error
+            places = " and ".join(map(str, aside))
+            hint = f"; the former state is in {places}: to use it again, move it back" if aside else ""
+            raise BackupError(f"cannot restore {file}: {error}{hint}") from error
     return found, aside
 
 
@@ -363,13 +371,14 @@ def _holds_state(folder: Path) -> bool:
     return folder.is_dir() and any(path.name != "lock" for path in folder.iterdir())
 
 
-def _move_aside(folder: Path, stamp: str) -> Path:
-    aside = folder.with_name(f"{folder.name}.before-{stamp}")
-    aside.mkdir(mode=0o700)
+def _is_inside(folder: Path, other: Path) -> bool:
+    return other.resolve() in folder.resolve().parents
+
+
+def _move_aside(folder: Path, aside: Path) -> None:
     for path in folder.iterdir():
         if path.name != "lock":  # which is held
             path.rename(aside / path.name)
-    return aside
 
 
 def _move(source: Path, folder: Path) -> None:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_master.backup import CERTIFICATES, MASTER, BackupError, back_up
+from rce_master import backup
+from rce_master.backup import CERTIFICATES, MASTER, BackupError, back_up, restore
 from rce_master.snapshots.service import SNAPSHOTS
-from rce_master.store.sqlite import SqliteStore
+from rce_master.store.sqlite import FILE_NAME, SqliteStore
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,3 +54,38 @@ async def test_a_copy_is_not_made_where_it_would_be_copied(tmp_path: Path, part:
     with pytest.raises(BackupError, match="name a file outside of"):
         back_up(folders, out)
     assert not out.exists()
+
+
+@pytest.fixture
+async def nested(tmp_path: Path) -> dict[str, Path]:
+    """Folders with a state, of which ``copy.tar`` is a copy, and a key that was made since."""
+    folders = {MASTER: tmp_path / "state", CERTIFICATES: tmp_path / "state" / "certificates"}
+    await (await SqliteStore.open(folders[MASTER])).close()
+    folders[CERTIFICATES].mkdir()
+    key = folders[CERTIFICATES] / "authority.key"
+    key.write_text("the copied one")
+    back_up(folders, tmp_path / "copy.tar")
+    key.write_text("a newer one")
+    return folders
+
+
+def test_certificates_inside_the_state_are_restored(nested: dict[str, Path], tmp_path: Path) -> None:
+    _, (aside,) = restore(tmp_path / "copy.tar", nested, replace=True)
+    assert (nested[MASTER] / FILE_NAME).exists()
+    assert (nested[CERTIFICATES] / "authority.key").read_text() == "the copied one"
+    assert (aside / FILE_NAME).exists()
+    assert (aside / "certificates" / "authority.key").read_text() == "a newer one"
+
+
+def test_a_restore_that_fails_tells_where_the_state_is(
+    nested: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: Path, __: Path) -> None:
+        raise OSError("no space")
+
+    monkeypatch.setattr(backup, "_move", fail)
+    with pytest.raises(BackupError, match="no space; the former state is in ") as refusal:
+        restore(tmp_path / "copy.tar", nested, replace=True)
+    (aside,) = tmp_path.glob("state.before-*")
+    assert f"{aside}: to use it again" in str(refusal.value)
+    assert (aside / FILE_NAME).exists()
