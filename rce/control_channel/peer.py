@@ -16,11 +16,12 @@ from rce.control import (
     ReadLog,
     SaveState,
     StateSaved,
+    Sync,
     TaskSetKind,
     ToTaskSet,
     encode,
 )
-from rce.control_channel.timeouts import MAX_QUEUED, ControlTimeouts
+from rce.control_channel.timeouts import MAX_QUEUED, MAX_TEXT, ControlTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +48,10 @@ class Peer:
         self._is_fenced = is_fenced
         self._socket = socket
         self._timeouts = timeouts
-        self._outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
+        self._outbox: asyncio.Queue[tuple[str, int]] = asyncio.Queue(MAX_QUEUED)
+        """Messages, and how many characters of each count."""
+        self._waiting = 0
+        """Characters that count and wait."""
         self._numbers = itertools.count(1)
         self._asked: dict[int, asyncio.Future[Any]] = {}
         """Answers that are waited for, by the numbers of the requests."""
@@ -77,12 +81,16 @@ class Peer:
         """Send a message; never blocks. A peer that is too far behind is disconnected, and dials again."""
         if self._left:
             return
-        try:
-            self._outbox.put_nowait(encode(message))
-        except asyncio.QueueFull:
+        if self._outbox.full() or self._waiting > MAX_TEXT:
             _log.warning("%r takes no messages; cut off", self)
             self.abort()
             self.leave()
+            return
+        text = encode(message)
+        # A whole state longer than the limit would be cut off with what follows it, on each connection.
+        count = 0 if isinstance(message, Sync) else len(text)
+        self._waiting += count
+        self._outbox.put_nowait((text, count))
 
     def abort(self) -> None:
         """Abort the connection."""
@@ -154,11 +162,12 @@ class Peer:
             ConnectionClosed: The connection ended.
         """
         while True:
-            message = await self._outbox.get()
+            text, count = await self._outbox.get()
             if self._is_fenced is not None and self._is_fenced():
                 self.abort()
                 return
-            await self._socket.send(message)
+            self._waiting -= count
+            await self._socket.send(text)
 
     def answer(self, message: LogChunk | StateSaved) -> None:
         """Take an answer to :meth:`read_log` or :meth:`save_state` (for the server)."""

@@ -44,6 +44,6 @@ MAX_FRAME = 256 * 2**20
 """Longest message, in bytes: ``Sync`` has the whole desired state of a task set. Both ends have
 authenticated; the master limits how much a user may ask for."""
 MAX_TEXT = MAX_FRAME // 4
-"""Most characters that surely fit."""
+"""Most characters that surely fit. If more wait for a peer, it is disconnected and starts again."""
 MAX_QUEUED = 8192
 """How many messages may wait for a peer; one that is further behind is disconnected and starts again."""
