@@ -119,8 +119,7 @@ async def _list(user: str) -> None:
     table = Table("package", "version", "size", "pushed", "used by", box=None)
     for one in found:
         version = one["version"] + (" (newest)" if one["newest"] else "")
-        used = ", ".join(one["nodes"]) or "-"
-        table.add_row(_name(one, found), version, _bytes(one["packed"]), _when(one["created"]), used)
+        table.add_row(_name(one, found), version, _bytes(one["packed"]), _when(one["created"]), _users(one))
     Console().print(table)
 
 
@@ -153,7 +152,7 @@ async def _show(name: str, version: str, user: str) -> None:
         ("sha256", one["sha256"]),
         ("signed by", one["key"]),
         ("pushed", _when(one["created"])),
-        ("used by", ", ".join(one["nodes"]) or "-"),
+        ("used by", _users(one)),
     ):
         table.add_row(key, value)
     Console().print(table)
@@ -238,6 +237,12 @@ def _of(user: str) -> dict[str, str | int]:
 def _name(one: dict[str, Any], found: list[dict[str, Any]]) -> str:
     several = len({other["user"] for other in found}) > 1
     return f"{one['user']}/{one['name']}" if several else str(one["name"])
+
+
+def _users(one: dict[str, Any]) -> str:
+    """Return the nodes that use a version; of many, some of them."""
+    more = one["node_count"] - len(one["nodes"])
+    return ", ".join(one["nodes"]) + (f", and {more} more" if more else "") or "-"
 
 
 def _when(seconds: float) -> str:

@@ -39,7 +39,6 @@ _QUERY = (OF_USER,)
 async def list_packages(call: Call) -> web.Response:
     """List all versions of all packages."""
     tables, scope = call.services.state_service.tables, call.scope
-    used = cache(lambda user: uses(tables, user))
     newest = cache(lambda user, name: find(tables, user, name))
 
     def whole() -> list[str]:
@@ -51,8 +50,7 @@ async def list_packages(call: Call) -> web.Response:
         one = tables.packages.get(key)
         if one is None:
             return []
-        is_newest = newest(one.user, one.name) == one
-        shown = _package_out(one, is_newest=is_newest, nodes=used(one.user).get(one.id))
+        shown = _package_out(tables, one, is_newest=newest(one.user, one.name) == one)
         return [(name, shown) for name in span.of(ALONE)]
 
     keys = keys_of_users(tables, tables.packages, "user", scope)
@@ -168,13 +166,13 @@ async def revoke_package_key(call: Call) -> None:
 
 def _shown(tables: Tables, package: UserPackage, warnings: tuple[str, ...] = ()) -> models.PackageOut:
     is_newest = find(tables, package.user, package.name) == package
-    nodes = uses(tables, package.user).get(package.id)
-    return _package_out(package, is_newest=is_newest, nodes=nodes, warnings=warnings)
+    return _package_out(tables, package, is_newest=is_newest, warnings=warnings)
 
 
 def _package_out(
-    package: UserPackage, *, is_newest: bool, nodes: list[str] | None, warnings: tuple[str, ...] = ()
+    tables: Tables, package: UserPackage, *, is_newest: bool, warnings: tuple[str, ...] = ()
 ) -> models.PackageOut:
+    used = uses(tables, package, is_newest=is_newest)
     return models.PackageOut(
         user=package.user,
         name=package.name,
@@ -190,7 +188,8 @@ def _package_out(
         digest=package.digest,
         key=key_id(package.key),
         created=package.created,
-        nodes=nodes or [],
+        nodes=list(used.first),
+        node_count=used.count,
         warnings=list(warnings),
     )
 

@@ -62,7 +62,9 @@ class PackageOut(Model):
     created: float
     """Seconds since 1970."""
     nodes: list[str]
-    """Nodes that use it, each ``CONTAINER/NODE``."""
+    """Some of the nodes that use it, each ``CONTAINER/NODE``."""
+    node_count: int
+    """How many nodes use it."""
     warnings: list[str] = Field(default=[])
     """Warnings for its owner; only in the answer to a push."""
 

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control import TaskSetKind
-from rce.model import EndpointId, Form, InterfaceType, Network, Resources, Role
+from rce.model import EndpointId, Form, InterfaceType, Network, Resources, Role, split_package
 from rce_master.state import capacity, endpoints
 from rce_master.state.lifecycle import RobotSession, VolumeMovePhase
 from rce_master.state.placement import Room
@@ -28,6 +28,7 @@ def validate(tables: Tables) -> None:
     _check_indexes(tables)
     _check_rooms(tables)
     _check_queue(tables)
+    _check_package_uses(tables)
     for endpoint in tables.endpoints:
         _check_endpoint(tables, endpoint)
     for link in tables.links:
@@ -58,6 +59,14 @@ def _check_indexes(tables: Tables) -> None:
             computed = {value: sorted(keys) for value, keys in table.computed_entries(index).items()}
             assert kept == computed, f"{table.name}: index {index} is out of date"
         assert table.totals == table.computed_totals, f"{table.name}: totals are out of date"
+
+
+def _check_package_uses(tables: Tables) -> None:
+    counts: dict[tuple[str, ...], Counter[str]] = {}
+    for container in tables.containers():
+        for node in container.nodes.values():
+            counts.setdefault((container.user, *split_package(node.pkg)), Counter())[container.id] += 1
+    assert tables.package_uses.counts == counts, "the nodes of packages are out of date"
 
 
 def _check_rooms(tables: Tables) -> None:

@@ -5,7 +5,9 @@ The contents of a version are kept elsewhere, under its hash; this module keeps 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 from rce.control import PackageSpec
@@ -17,12 +19,16 @@ from rce_master.state.records import Container
 from rce_master.state.user_records import UserPackage, package_key_key, user_package_key
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterator
 
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddPackage, AddPackageKey, RemovePackage, RemovePackageKey
+    from rce_master.state.package_uses import Named
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
+
+SHOWN = 10
+"""How many nodes that need a version are named; others are counted."""
 
 
 def add_key(tx: Transaction, command: AddPackageKey) -> None:
@@ -113,11 +119,11 @@ def remove_package(tx: Transaction, command: RemovePackage) -> None:
     found = tx.tables.packages.get(user_package_key(command.user, command.name, command.version))
     if found is None:
         raise NotFoundError(f"there is no package {command.name!r} of version {command.version!r}")
-    users = uses(tx.tables, found.user).get(found.id)
-    if users:
+    used = uses(tx.tables, found, is_newest=find(tx.tables, found.user, found.name) == found)
+    if used.count:
         raise ConflictError(
-            f"{found.name} {found.version} is used by {', '.join(users)}; remove the nodes first, or let them"
-            " name another version"
+            f"{found.name} {found.version} is used by {used}; remove the nodes first, or let them name"
+            " another version"
         )
     tx.delete(tx.tables.packages, found.id)
     tx.happen("package_removed", found.id)
@@ -144,16 +150,40 @@ def _finder(tables: Tables, user: str) -> Callable[[str], UserPackage | None]:
     return cache(lambda pkg: find(tables, user, pkg))
 
 
-def uses(tables: Tables, user: str) -> dict[str, list[str]]:
-    """Return the nodes of a user that need each version: ``CONTAINER/NODE`` by the versions' ids."""
-    found: dict[str, list[str]] = {}
-    lookup = _finder(tables, user)
-    for container in tables.containers(user):
+@dataclass(frozen=True, slots=True)
+class Uses:
+    """The nodes that need a version."""
+
+    count: int
+    first: tuple[str, ...]
+    """Some of them, each ``CONTAINER/NODE``."""
+
+    def __str__(self) -> str:
+        more = self.count - len(self.first)
+        return ", ".join(self.first) + (f", and {more} more" if more else "")
+
+
+def uses(tables: Tables, package: UserPackage, *, is_newest: bool) -> Uses:
+    """Return which nodes need a version, in a time that does not grow with the number of other nodes.
+
+    Args:
+        tables: The tables.
+        package: The version.
+        is_newest: Whether nodes that name no version get this one.
+    """
+    versions = (package.version, "") if is_newest else (package.version,)
+    named = [(package.user, package.name, version) for version in versions]
+    count = sum(map(tables.package_uses.count, named))
+    return Uses(count, tuple(islice(chain.from_iterable(_nodes_of(tables, one) for one in named), SHOWN)))
+
+
+def _nodes_of(tables: Tables, named: Named) -> Iterator[str]:
+    for id_ in tables.package_uses.containers(named):
+        container = tables.container(id_)
+        assert container is not None
         for node in container.nodes.values():
-            package = lookup(node.pkg)
-            if package is not None:
-                found.setdefault(package.id, []).append(f"{container.tag}/{node.tag}")
-    return found
+            if (container.user, *split_package(node.pkg)) == named:
+                yield f"{container.tag}/{node.tag}"
 
 
 def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
@@ -187,10 +217,5 @@ def _spec(package: UserPackage) -> PackageSpec:
 
 
 def _touch_users_of(tx: Transaction, package: UserPackage) -> None:
-    for container in tx.tables.containers(package.user):
-        if _names(container.nodes.values(), package.name):
-            tx.touch(container.id)
-
-
-def _names(nodes: Iterable[NodeSpec], name: str) -> bool:
-    return any(node.pkg == name for node in nodes)
+    for id_ in list(tx.tables.package_uses.containers((package.user, package.name, ""))):
+        tx.touch(id_)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rce.control import TaskSetKind
 from rce_master.state.lifecycle import RobotSession
+from rce_master.state.package_uses import PackageUses
 from rce_master.state.promises import Promises
 from rce_master.state.records import (
     Container,
@@ -203,6 +204,7 @@ class Tables:
             drains=self.drains,
             on_gain=self.queue.offer,
         )
+        self.package_uses = PackageUses(self.endpoints)
         self.requested = Promises()
         """What each user's containers ask for."""
         self.endpoints.watch(self._count_requests)
