@@ -36,6 +36,7 @@ from rce_master.exceptions import (
     FencedError,
     ForbiddenError,
     MasterError,
+    NotFoundError,
     RefusedError,
     SaveTooLargeError,
     StoreError,
@@ -69,6 +70,14 @@ MAX_LOGINS = 4096
 
 MAX_TERMS_AHEAD = 1_000_000
 """A task set that has seen a term so far ahead is not believed: terms must not run out."""
+
+_REMOVALS = (
+    commands.DestroyContainer,
+    commands.RemoveNode,
+    commands.RemoveInterface,
+    commands.DeleteParameter,
+    commands.Disconnect,
+)
 
 _UNAUTHORIZED, _FORBIDDEN, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 403, 409, 429, 503
 
@@ -299,13 +308,22 @@ class ControlHandler:
         faults: list[str],
     ) -> None:
         found = [error for part in outcomes for error in await part]
-        refused = [(one, error) for one, error in zip(wanted, found, strict=True) if error is not None]
+        refused = [
+            (one, error)
+            for one, error in zip(wanted, found, strict=True)
+            if error is not None and not (request.repeated and _was_removed(one, error))
+        ]
         reply = ClientReply(
             request=request.request,
             errors=(*faults, *(f"{request.type}: {error}" for _, error in refused)),
             faults=(*(RequestFault() for _ in faults), *(_fault_of(one, error) for one, error in refused)),
         )
         peer.send(reply)
+
+
+def _was_removed(command: commands.Request, error: MasterError) -> bool:
+    """Whether a removal was refused because what it removes is not there."""
+    return isinstance(command, _REMOVALS) and isinstance(error, NotFoundError)
 
 
 def _fault_of(command: commands.Request, error: MasterError) -> RequestFault:

@@ -252,6 +252,8 @@ class ClientRequest(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """As the client sent it, for masters of the release before; else None."""
     content: Request | None = None
     """The request; for masters whose ``features`` name :data:`TYPED_REQUESTS`."""
+    repeated: bool = False
+    """Whether it was sent before, and may have been done; a master of an earlier release passes over this."""
 
 
 class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):

@@ -2,7 +2,7 @@
 
 One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which has the whole
 state of the task set, so the channel keeps no reports while it is not connected. It keeps requests until they
-are answered: they are idempotent, and are sent again on the next connection.
+are answered: they are idempotent, and are sent again on the next connection, marked as repeated.
 """
 
 from __future__ import annotations
@@ -81,9 +81,20 @@ class _OldTermError(Exception):
 class _Pending:
     """A request that waits for its answer."""
 
-    def __init__(self, text: str, reply: asyncio.Future[Any]) -> None:
-        self.text = text
+    def __init__(self, message: Login | ClientRequest, reply: asyncio.Future[Any]) -> None:
         self.reply = reply
+        self._message = message
+        self._text = _written(message)
+        self._was_sent = False
+
+    def take_text(self) -> str:
+        """Return what is to be sent now; from the second time on, it says that it was sent before."""
+        message = self._message
+        if self._was_sent and isinstance(message, ClientRequest) and not message.repeated:
+            self._message = replace(message, repeated=True)
+            self._text = encode(self._message)
+        self._was_sent = True
+        return self._text
 
 
 class TaskSetChannel:
@@ -220,9 +231,10 @@ class TaskSetChannel:
 
     async def _request(self, message: Login | ClientRequest, kind: type[Reply]) -> Reply:
         # Written before it is kept: one that cannot be sent must fail here, and not on every connection.
-        pending = _Pending(_written(message), asyncio.get_running_loop().create_future())
+        pending = _Pending(message, asyncio.get_running_loop().create_future())
         self._pending[message.request] = pending
-        self._post(pending.text)
+        if self._outbox is not None:
+            self._post(pending.take_text())
         try:
             await self._answered(pending)
         finally:
@@ -338,7 +350,7 @@ class TaskSetChannel:
     async def _write(self, socket: ClientConnection, outbox: asyncio.Queue[str]) -> None:
         # Hello is made in the same step in which sending begins to count, so no change falls between the two.
         hello = replace(self._hello(), term=self._terms.newest)
-        first = [encode(hello), *(pending.text for pending in self._pending.values())]
+        first = [encode(hello), *(pending.take_text() for pending in self._pending.values())]
         while not outbox.empty():
             outbox.get_nowait()
         for text in first:

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 from support.absent_masters import unreachable_port
 from support.control_ends import QUICK, SECRET, Master, TaskSet, headers, hello
 from support.ports import free_port
@@ -125,6 +126,26 @@ async def test_unanswered_request_is_sent_again_to_a_restarted_master() -> None:
                 assert await second.hellos.get()
                 assert second.seen["Login"] == 1
                 await robots.channel.wait_connected()
+
+
+async def test_a_request_says_that_it_was_sent_before() -> None:
+    """It may have been done then; one that waited for its first connection was not."""
+    master = Master()
+    master.mute = True
+    async with master.server:
+        robots = TaskSet(master.server.port)
+        asking = asyncio.create_task(robots.channel.client_request("u/r", "DC", {"containerTag": "c"}))
+        await asyncio.sleep(0)
+        async with robots.running():
+            peer, _ = await master.hellos.get()
+            first = await master.messages.get()
+            assert isinstance(first, ClientRequest)
+            assert not first.repeated
+            peer.abort()
+            peer, _ = await master.hellos.get()
+            assert await master.messages.get() == structs.replace(first, repeated=True)
+            peer.send(ClientReply(request=first.request))
+            assert (await asking).errors == ()
 
 
 async def test_send_without_a_connection_is_dropped() -> None:

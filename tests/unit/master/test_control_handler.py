@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.master_cloud import Cloud, add, drain, wire
+from support.master_cloud import CX, Cloud, add, drain, wire
 
 from rce.control.desired import DesiredState, Fit
 from rce.control.messages import (
@@ -192,6 +192,39 @@ async def test_logs_are_read_where_the_container_is(cloud: Cloud) -> None:
     containers.log = LogChunk(request=0, offset=0, text="away")
     with pytest.raises(TaskSetAwayError, match="did not answer"):
         await cloud.reconciler.read_log("anna/c", "n", 0, 10)
+
+
+async def test_a_removal_that_was_done_may_be_repeated(cloud: Cloud) -> None:
+    """Its answer was lost with the connection, or with the master."""
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await wire(robots)
+
+    async def errors(kind: str, data: object, *, repeated: bool) -> tuple[str, ...]:
+        asked = ClientRequest(request=99, id="anna/rob", type=kind, data=data, repeated=repeated)
+        await robots.say(asked)
+        reply = await robots.get(ClientReply)
+        assert len(reply.faults) == len(reply.errors)
+        return reply.errors
+
+    parts = {
+        "removeNodes": [{"containerTag": "c", "nodeTag": "n"}],
+        "removeInterfaces": [{"endpointTag": "c", "interfaceTag": "in"}],
+        "deleteParam": [{"containerTag": "c", "name": "p"}],
+        "setParam": [{"containerTag": "d", "name": "p", "value": 1}],
+    }
+    removals = (
+        ("CX", {"disconnect": CX["connect"]}, 0),
+        ("CN", parts, 1),
+        ("DC", {"containerTag": "c"}, 0),
+    )
+    for kind, data, others in removals:
+        await errors(kind, data, repeated=False)
+        told = await errors(kind, data, repeated=True)
+        assert len(told) == others, told
+    assert "there is no container 'c'" in "".join(await errors("DC", {"containerTag": "c"}, repeated=False))
+    assert "there is no robot or container 'c'" in "".join(await errors("CN", add("x"), repeated=True))
 
 
 @pytest.mark.parametrize(("most", "code"), [(None, "busy"), (1, "")])
