@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import finish
 from rce.control import TaskSetKind
 from rce.guard import CrowdedError, Turns
 from rce.packages import BadKeyError, BadSignatureError, statement, verify
@@ -99,7 +100,8 @@ class PackageService:
             package = self._package(request, incoming, contents)
             packages.check_new(self._state_service.tables, package)
             async with self._keeper.keep(incoming) as warning:
-                await self._state_service.submit(commands.AddPackage(package=package))
+                # To its end: contents that the state is about to name must not be removed.
+                await finish(self._state_service.submit(commands.AddPackage(package=package)))
         return package, contents, warning
 
     async def _inspect(self, user: str, incoming: Incoming) -> Contents:
