@@ -14,7 +14,8 @@ REPEAT_S = 30.0
 """How long a POST whose answer was lost is repeated: another master may have to take the lead."""
 LEADER_S = 8.0
 """How long a request waits for a leading master, if a stand-by answers."""
-_NOT_NOW = (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
+NOT_NOW = (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
+"""Statuses of a master that has no leader just now."""
 
 
 class Attempts:
@@ -109,4 +110,4 @@ def _is_unled(status: int, headers: Mapping[str, str], *, reads: bool) -> bool:
 def _is_undecided(status: int, headers: Mapping[str, str]) -> bool:
     """Return whether an answer leaves open if a request was done that was sent before."""
     is_under_way = status == HTTPStatus.CONFLICT and "Retry-After" in headers
-    return is_under_way or status in _NOT_NOW
+    return is_under_way or status in NOT_NOW

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import uuid
-from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -17,7 +16,7 @@ import typer
 from rce.masters import Masters
 from rce.tls import CertificateError, client_context, explain_to_client
 from rce.web.client import Sent, noting_sent, session_connector
-from rce_master.cli.attempts import Attempts
+from rce_master.cli.attempts import NOT_NOW, Attempts
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from typing import Self
 
     from rce_master.cli.credentials import Credentials
+
+OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 REQUEST_S = 30.0
 CONNECT_S = 3.0
@@ -44,8 +45,6 @@ IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000
 _OK = 400
 _REDIRECTS = 300, 400
-_NOT_NOW = (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
-"""Statuses of a master that has no leader just now."""
 _REPEATED = ("GET", "POST")
 """Methods of requests that may be sent again: they change nothing, or are done once by their keys."""
 _CLOSE = aiohttp.ClientWSTimeout(ws_close=5.0)
@@ -296,7 +295,7 @@ class ApiClient:
                     yield event
                 reached = True
             except (aiohttp.ClientError, TimeoutError, ApiError) as error:
-                if isinstance(error, ApiError) and error.status not in _NOT_NOW:
+                if isinstance(error, ApiError) and error.status not in NOT_NOW:
                     raise
                 untried -= 1
                 if not reached and last is None and untried <= 0:
@@ -351,3 +350,8 @@ def run(work: Coroutine[Any, Any, None]) -> None:
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
+
+
+def of_user(user: str) -> dict[str, str | int]:
+    """Return the query of a request about what belongs to a user; empty: to the caller."""
+    return {"user": user} if user else {}

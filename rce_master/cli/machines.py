@@ -12,7 +12,7 @@ from rich.table import Table
 
 from rce.model import about, write_cores
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, run
+from rce_master.cli.client import ApiClient, of_user, run
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.cli.show import console
 
@@ -210,9 +210,8 @@ def resize(
 
 
 async def _resize(container: str, body: dict[str, Any], user: str) -> None:
-    query: dict[str, str | int] = {"user": user} if user else {}
     async with ApiClient.of(credentials.load()) as client:
-        await client.call("PATCH", f"/containers/{container}", body, query)
+        await client.call("PATCH", f"/containers/{container}", body, of_user(user))
     typer.echo(f"resized {container}: {', '.join(f'{key} {value}' for key, value in body.items())}")
 
 
@@ -231,7 +230,7 @@ def move(
 
 
 async def _move(container: str, machine: str, user: str, *, wait: bool) -> None:
-    query: dict[str, str | int] = {"user": user} if user else {}
+    query = of_user(user)
     async with ApiClient.of(credentials.load()) as client:
         await client.call("PUT", f"/containers/{container}/machine", {"machine": machine}, query)
         typer.echo(f"{container} moves to {machine}")

@@ -17,7 +17,7 @@ from rich.table import Table
 from rce.packages import BadArchiveError, SigningKey, key_id, statement
 from rce.packages.folder import Source, look_into
 from rce_master.cli import credentials, signing_key
-from rce_master.cli.client import ApiClient, run
+from rce_master.cli.client import ApiClient, OfUser, of_user, run
 from rce_master.cli.exceptions import CliError
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ app.add_typer(keys, name="key")
 _CHUNK = 1 << 20
 _LISTED = 40
 """How many files of a package are shown, unless all are asked for."""
-
-OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("push")
@@ -115,7 +113,7 @@ def list_(user: OfUser = "") -> None:
 
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = await client.items("/packages", query=_of(user))
+        found = await client.items("/packages", query=of_user(user))
     table = Table("package", "version", "size", "pushed", "used by", box=None)
     for one in found:
         version = one["version"] + (" (newest)" if one["newest"] else "")
@@ -136,7 +134,7 @@ def show(
 async def _show(name: str, version: str, user: str) -> None:
     login = credentials.load()
     async with ApiClient.of(login) as client:
-        found = await client.items("/packages", query=_of(user or login.user))
+        found = await client.items("/packages", query=of_user(user or login.user))
     fitting = [one for one in found if one["name"] == name]
     fitting = [one for one in fitting if (one["version"] == version if version else one["newest"])]
     if not fitting:
@@ -170,7 +168,7 @@ def remove(
 
 async def _remove(name: str, version: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        await client.call("DELETE", f"/packages/{name}/{version}", query=_of(user))
+        await client.call("DELETE", f"/packages/{name}/{version}", query=of_user(user))
     typer.echo(f"removed {name}@{version}")
 
 
@@ -217,7 +215,7 @@ def revoke_key(key: Annotated[str, typer.Argument(help="Its id, as `rce package 
 async def _revoke_key(id_: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         await client.call("DELETE", f"/package-keys/{id_}")
-        found = await client.items("/packages", query=_of(credentials.load().user))
+        found = await client.items("/packages", query=of_user(credentials.load().user))
     typer.echo(f"revoked {id_}")
     signed = [f"{one['name']}@{one['version']}" for one in found if one["key"] == id_]
     if signed:
@@ -228,10 +226,6 @@ async def _register(client: ApiClient, key: SigningKey, label: str = "") -> None
     body = {"key": key.public, "label": label or socket.gethostname()[:128]}
     reply = await client.call("POST", "/package-keys", body)
     typer.echo(f"registered the key {reply['id']} ({signing_key.key_file()})")
-
-
-def _of(user: str) -> dict[str, str | int]:
-    return {"user": user} if user else {}
 
 
 def _name(one: dict[str, Any], found: list[dict[str, Any]]) -> str:

@@ -11,12 +11,10 @@ from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, run
+from rce_master.cli.client import ApiClient, OfUser, of_user, run
 from rce_master.cli.exceptions import CliError
 
 app = typer.Typer(no_args_is_help=True, help="List and remove saved states of nodes.")
-
-OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("list")
@@ -27,7 +25,7 @@ def list_(user: OfUser = "") -> None:
 
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = await client.items("/states", query=_of(user))
+        found = await client.items("/states", query=of_user(user))
     several = len({one["user"] for one in found}) > 1
     table = Table("node", "size", "saved", "at", box=None)
     for one in found:
@@ -56,9 +54,5 @@ def remove(
 
 async def _remove(container: str, tag: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        await client.call("DELETE", f"/states/{container}/{tag}", query=_of(user))
+        await client.call("DELETE", f"/states/{container}/{tag}", query=of_user(user))
     typer.echo(f"removed the saved state of {container}/{tag}")
-
-
-def _of(user: str) -> dict[str, str | int]:
-    return {"user": user} if user else {}

@@ -10,13 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, run
+from rce_master.cli.client import ApiClient, OfUser, of_user, run
 from rce_master.cli.exceptions import NotLoggedInError
 
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
 robots = typer.Typer(no_args_is_help=True, help="Add, list and revoke tokens of robots.")
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 Label = Annotated[str, typer.Option(help="Your name for the token.")]
 Days = Annotated[float, typer.Option(help="Days until it expires; 0: valid until it is revoked.", min=0)]
 
@@ -96,7 +95,7 @@ def revoke_robots(
 
 async def _list(path: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = await client.items(path, "tokens", _of(user))
+        found = await client.items(path, "tokens", of_user(user))
     table = Table("id", "for", "label", "since", "expires", "last used", box=None)
     for each in sorted(found, key=lambda one: float(one["created"])):
         table.add_row(
@@ -112,7 +111,7 @@ async def _list(path: str, user: str) -> None:
 
 async def _new(path: str, body: dict[str, Any], user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        reply = await client.call("POST", path, body, query=_of(user))
+        reply = await client.call("POST", path, body, query=of_user(user))
     typer.echo(reply["token"])
     until = f"until {_day(reply['expires'])}" if reply["expires"] else "until it is revoked"
     typer.echo(f"rce: good for {reply['scope']} of user {reply['userID']}, {until}; shown only now", err=True)
@@ -121,12 +120,8 @@ async def _new(path: str, body: dict[str, Any], user: str) -> None:
 async def _revoke(path: str, names: list[str], user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         for name in names:
-            await client.call("DELETE", f"{path}/{name}", query=_of(user))
+            await client.call("DELETE", f"{path}/{name}", query=of_user(user))
             typer.echo(f"revoked {name}")
-
-
-def _of(user: str) -> dict[str, str | int]:
-    return {"user": user} if user else {}
 
 
 def _day(when: float) -> str:

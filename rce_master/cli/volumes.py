@@ -11,11 +11,9 @@ from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, run
+from rce_master.cli.client import ApiClient, OfUser, of_user, run
 
 app = typer.Typer(no_args_is_help=True, help="List and remove volumes of containers.")
-
-OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("list")
@@ -26,7 +24,7 @@ def list_(user: OfUser = "") -> None:
 
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = await client.items("/volumes", query=_of(user))
+        found = await client.items("/volumes", query=of_user(user))
     several = len({one["user"] for one in found}) > 1
     table = Table("volume", "used", "size", "machine", "container", "path", "snapshot", box=None)
     for one in found:
@@ -64,9 +62,5 @@ def remove(
 
 async def _remove(name: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        await client.call("DELETE", f"/volumes/{name}", query=_of(user))
+        await client.call("DELETE", f"/volumes/{name}", query=of_user(user))
     typer.echo(f"removed {name}")
-
-
-def _of(user: str) -> dict[str, str | int]:
-    return {"user": user} if user else {}
