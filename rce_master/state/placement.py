@@ -208,7 +208,7 @@ class Room:
         return load
 
 
-def choose(
+def best_of(
     rooms: Iterable[Room],
     requested: Resources,
     *,
@@ -218,25 +218,14 @@ def choose(
     """Choose the machine for a container.
 
     Args:
-        rooms: The machines that may be taken.
+        rooms: The machines that take it.
         requested: What the container asks for.
         company: How much of what belongs together with it is where, by process.
         own: How many other containers of its user are where, by process.
 
     Returns:
-        The best, or None if it fits nowhere.
+        The best; None without any room.
     """
-    return best_of((room for room in rooms if room.fits(requested)), requested, company=company, own=own)
-
-
-def best_of(
-    rooms: Iterable[Room],
-    requested: Resources,
-    *,
-    company: Mapping[str, int] | None = None,
-    own: Mapping[str, int] | None = None,
-) -> Room | None:
-    """Choose the machine for a container of those that take it; the arguments are as for :func:`choose`."""
     fitting = list(rooms)
     if not fitting:
         return None

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from rce_master.store.base import Row, Snapshot
     from rce_master.store.etcd.client import EtcdClient
-    from rce_master.store.etcd.layout import Leader
     from rce_master.store.etcd.wire import Outcome, Page
 
 PAGE_ROWS = 500
@@ -96,14 +95,6 @@ class EtcdStore:
     def begun(self) -> int:
         """The revision at which this store's term was begun."""
         return self._begun
-
-    async def leader(self) -> Leader | None:
-        """Tell which master leads; None if none does.
-
-        Raises:
-            StoreError: etcd cannot be asked.
-        """
-        return (await self.leadership()).leader
 
     async def leadership(self) -> LeadershipView:
         """Tell which master leads, and what stand-bys need to know.

@@ -110,7 +110,7 @@ async def test_a_master_without_its_control_port_ends(tmp_path: Path) -> None:
             assert await master.process.wait() == 1
         assert "--control-port" in master.output().splitlines()[-1]
         async with EtcdClient(etcd.endpoints, attempt=PATIENT_S) as client:
-            assert await EtcdStore(client, "/rce").leader() is None
+            assert (await EtcdStore(client, "/rce").leadership()).leader is None
 
 
 @pytest.mark.needs("etcd")

@@ -65,7 +65,7 @@ async def test_a_second_leader_is_refused_while_the_first_one_leads(client: Etcd
         await lead(client, prefix)
     with pytest.raises(StoreBusyError):
         await EtcdStore(client, prefix).begin_term()
-    assert (found := await EtcdStore(client, prefix).leader()) is not None
+    assert (found := (await EtcdStore(client, prefix).leadership()).leader) is not None
     assert (found.name, found.term) == ("one:9000", term)
     await client.revoke(lease)
     assert not await first.holds_lead()

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.parts import MachineParts
+from support.placement import choose
 
 from rce.control.messages import MachineInfo
 from rce.model.specs import Network, Resources
-from rce_master.state.placement import DETOUR, Room, choose, refusals
+from rce_master.state.placement import DETOUR, Room, refusals
 
 MB = 1 << 20
 SHORT_OF_MEMORY = "m1 has 40 of 100 MB memory free, 50 MB needed"

@@ -7,6 +7,7 @@ from random import Random
 
 import pytest
 from support.master_world import World
+from support.placement import choose
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.model.specs import Network, Resources
@@ -14,7 +15,6 @@ from rce.model.volumes import Volume
 from rce_master.exceptions import RefusedError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
-from rce_master.state.placement import choose
 from rce_master.state.rooms import CANDIDATES
 from rce_master.state.settings import StateSettings
 
