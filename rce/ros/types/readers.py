@@ -153,8 +153,11 @@ class ReaderBuilder:
 
     def _messages(self, field: Field, message_type: MessageType, count: str, value: str) -> None:
         code = self._code
-        if message_type.min_size == 0 and field.length is None:
-            code.line(f"if {count} > {MAX_EMPTY_ELEMENTS}: raise Refused")
+        if field.length is None:
+            # Before the loop: reading arrays of numbers beyond the end of the buffer does not fail.
+            size = message_type.min_size
+            too_many = f"{count} * {size} > len(b) - p" if size else f"{count} > {MAX_EMPTY_ELEMENTS}"
+            code.line(f"if {too_many}: raise Refused")
         code.line(f"{value} = []")
         code.line(f"for _ in range({count}):")
         code.line(f"    x, p = {code.bind(self._reader_of(message_type))}(b, p)")

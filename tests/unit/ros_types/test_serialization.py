@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from rce.ros.types import Duration, Field, MessageType, SerializationError, Time, TypeRegistry
+from rce.ros.types import Duration, Field, MessageType, SerializationError, Time, TypeRegistry, objects
 from rce.ros.types.registry import builtin_definitions
 from rce.ros.types.values import NUMBERS
 
@@ -255,6 +255,20 @@ def test_a_hostile_length_of_empty_messages_costs_nothing() -> None:
     assert len(kind.deserialize(struct.pack("<I", 3)).n) == 3
     with pytest.raises(SerializationError, match="elements without content"):
         kind.deserialize(b"\xff" * 4)
+
+
+def test_hostile_length_of_fixed_arrays_is_refused_unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of ``shape_msgs/Mesh``: beyond the end of a message, arrays of numbers are read without an error."""
+    read: list[str] = []
+    monkeypatch.setattr(objects, "unpack_numbers", lambda code, _: read.append(code))
+    kind = TypeRegistry().from_definition(
+        "mine/Mesh", f"Triangle[] t\n{SEPARATOR}\nMSG: mine/Triangle\nuint32[3] corners\n"
+    )
+    with pytest.raises(SerializationError, match=r"t\[2\].corners: the message ends after 28 bytes"):
+        kind.deserialize(struct.pack("<I", 1000) + bytes(24))
+    assert not read
+    kind.deserialize(struct.pack("<I", 2) + bytes(24))
+    assert len(read) == 2
 
 
 def test_times_convert_and_compare() -> None:
