@@ -7,13 +7,14 @@ import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any
 
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.ros.errors import (
+    MasterError,
     ParameterMissingError,
     RpcRefusedError,
     RpcUnreachableError,
@@ -79,12 +80,14 @@ class Registrar:
         self._unsure: set[str] = set()
         """Remote masters of which a call was not answered: what it registered may be there or not."""
         self._told: set[str] = set()
+        self._publishers: dict[str, Mapping[str, Collection[str]]] = {}
+        """By the remote master: topic -> URIs of its publishers there, as they were told last."""
 
     async def hold(
         self,
         origin: str,
         wanted: set[Registration],
-        publishers: Mapping[str, Iterable[str]],
+        publishers: Mapping[str, Collection[str]],
         *,
         stale: AbstractSet[str] = frozenset(),
         again: bool = False,
@@ -105,13 +108,14 @@ class Registrar:
             MasterError: The local master does not answer; to be tried again.
         """
         async with self._lock:
+            self._publishers[origin] = publishers
             held = self.held.get(origin, set())
             again = again or origin in self._unsure
             await self._unregister(origin, held - wanted)
             await self._give_way(origin, wanted - held, stale)
             fine, clashes = await self._without_clashes(origin, wanted if again else wanted - held)
             held -= {clash.registration for clash in clashes}  # a node here took the name from it
-            await self._register(origin, fine, publishers)
+            await self._register(origin, fine)
         for clash in clashes:
             self._tell_once(str(clash))
         return clashes
@@ -125,19 +129,26 @@ class Registrar:
         async with self._lock:
             await self._unregister(origin, set(self.held.get(origin, ())))
             self._unsure.discard(origin)
+            self._publishers.pop(origin, None)
 
     async def restore(self) -> None:
         """Register everything again: the local master was restarted.
 
+        What is at the master already, as it was registered since, stays this synchronization's own.
+
         Raises:
-            MasterError: It does not answer.
+            MasterError: It does not answer; to be tried again.
         """
         async with self._lock:
-            everything, self.held = self.held, {}
             self._recorded.clear()
-            for origin, entries in everything.items():
-                fine, _ = await self._without_clashes(origin, entries)
-                await self._register(origin, fine, {})
+            self._unsure |= self.held.keys()
+            for origin, entries in list(self.held.items()):
+                fine, clashes = await self._without_clashes(origin, entries)
+                entries -= {clash.registration for clash in clashes}  # a node here took the name from it
+                if not entries:
+                    del self.held[origin]
+                await self._register(origin, fine)
+                await self._record(origin)
 
     async def take_back_leftovers(self) -> None:
         """Remove the registrations of a synchronization that was killed.
@@ -189,9 +200,7 @@ class Registrar:
         provided = {name: uri for name, uri in zip(services, addresses, strict=True) if uri}
         return split_clashes(candidates, taken, provided)
 
-    async def _register(
-        self, origin: str, entries: set[Registration], publishers: Mapping[str, Iterable[str]]
-    ) -> None:
+    async def _register(self, origin: str, entries: set[Registration]) -> None:
         if not entries:
             return
         ordered = sorted(entries, key=lambda entry: (_ORDER.index(entry.kind), entry.name, entry.node))
@@ -204,8 +213,7 @@ class Registrar:
         for entry, answer in zip(ordered, answers, strict=True):
             _log.info("%s %s of %s is registered", entry.kind.value, entry.name, entry.node)
             if entry.kind is RegistrationKind.SUBSCRIBER and isinstance(answer, list) and answer:
-                uris = [*dict.fromkeys([*publishers.get(entry.name, ()), *answer])]
-                self._tasks.spawn(self._tell_subscriber(entry, uris), name=f"tell {entry.node}")
+                self._tasks.spawn(self._tell_subscriber(origin, entry, answer), name=f"tell {entry.node}")
 
     async def _unregister(self, origin: str, entries: set[Registration]) -> None:
         if not entries:
@@ -237,13 +245,14 @@ class Registrar:
         with contextlib.suppress(ParameterMissingError):  # as after a restart of the master
             await self._node.delete_param(name)
 
-    async def _tell_subscriber(self, entry: Registration, uris: list[str]) -> None:
+    async def _tell_subscriber(self, origin: str, entry: Registration, here: list[str]) -> None:
         """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
-        arguments = (MASTER_CALLER, entry.name, uris)
         left = UPDATE_ATTEMPTS
         pauses = RETRY.start()
-        while True:
+        while here:
             left -= 1
+            there = self._publishers.get(origin, {}).get(entry.name, ())
+            arguments = (MASTER_CALLER, entry.name, [*dict.fromkeys([*there, *here])])
             try:
                 await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)
             except XmlRpcError as error:
@@ -251,9 +260,25 @@ class Registrar:
                 if is_gone or not left:
                     _log.warning("%s does not learn of publishers of %s: %s", entry.node, entry.name, error)
                     return
-                await asyncio.sleep(pauses.next())  # it may be busy, or out of reach for a moment
             else:
                 return
+            await asyncio.sleep(pauses.next())  # it may be busy, or out of reach for a moment
+            with contextlib.suppress(MasterError):  # then those that it named last are told
+                here = await self._publishers_here(origin, entry)
+
+    async def _publishers_here(self, origin: str, entry: Registration) -> list[str]:
+        """Ask the master for the publishers of a remote subscriber; none if that is not held any longer.
+
+        The master may have told the subscriber of a change meanwhile, which must not be undone.
+
+        Raises:
+            MasterError: The master does not answer.
+        """
+        async with self._lock:
+            if entry not in self.held.get(origin, ()):
+                return []
+            (answer,) = await multicall_as(self._master, [_registering(entry)])
+        return answer if isinstance(answer, list) else []
 
     def _tell_once(self, text: str) -> None:
         if text not in self._told:
