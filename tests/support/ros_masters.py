@@ -30,6 +30,7 @@ class HoldingMaster:
         calls: The methods that were called with this name, in the order in which they were answered.
         held: How many registrations are held.
         refuses: Whether registrations of the name are refused.
+        failures: How many of the calls that unregister the name are not carried out.
     """
 
     def __init__(self, core_uri: str, name: str) -> None:
@@ -37,6 +38,7 @@ class HoldingMaster:
         self.calls: list[str] = []
         self.held = 0
         self.refuses = False
+        self.failures = 0
         self._core_uri = core_uri
         self._name = name
         self._released = threading.Event()
@@ -54,6 +56,9 @@ class HoldingMaster:
             if self.refuses:
                 self.calls.append(method)
                 return -1, "refused", 0
+        if concerns and method.startswith("unregister") and self.failures:
+            self.failures -= 1
+            raise RuntimeError("too busy")
         with xmlrpc.client.ServerProxy(self._core_uri) as core:
             answer: Any = getattr(core, method)(*arguments)
         if concerns:

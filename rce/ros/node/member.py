@@ -292,7 +292,7 @@ class GraphMember:
 
         async def release(service: Service) -> None:
             del self._services[service.name]
-            await registration.end()
+            await registration.release()
 
         service = self._services[name] = Service(runtime, name, service_type, handler, release)
         try:

@@ -135,6 +135,18 @@ class Registration:
         """Take it back in the background: it failed, or its last handle was cancelled."""
         self._owner.abandon(self)
 
+    async def release(self) -> None:
+        """Take it back, as :meth:`end`; in the background if that fails or is cancelled.
+
+        Raises:
+            MasterError: The master does not take it now.
+        """
+        try:
+            await self.end()
+        except BaseException:
+            self.abandon()
+            raise
+
     async def end(self) -> None:
         """Take it back, unless the subject is needed again.
 

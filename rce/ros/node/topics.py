@@ -56,7 +56,7 @@ class Topics:
 
         async def release(publisher: Publisher) -> None:
             if self._remove_publisher(output, publisher):
-                await output.registration.end()
+                await output.registration.release()
 
         publisher = Publisher(output, latch=latch, release=release)
         output.publishers.append(publisher)
@@ -107,7 +107,7 @@ class Topics:
 
         async def release(subscriber: Subscriber) -> None:
             if self._remove_subscriber(source, subscriber):
-                await source.registration.end()
+                await source.registration.release()
 
         subscriber = Subscriber(
             topic,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 import pytest
 from support.ros_masters import HoldingMaster, serving
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterRefusedError
+from rce.ros.errors import MasterRefusedError, MasterUnreachableError
 from rce.ros.node import Node, Publisher, Subscriber
 
 STRING = "std_msgs/String"
@@ -122,6 +123,19 @@ async def test_cancelled_registration_is_taken_back(
             if not leaves:
                 await until_called(master, [f"register{kind}", f"unregister{kind}"])
                 assert "/t" not in names(core)
+        await until_called(master, [f"register{kind}", f"unregister{kind}"])
+        assert "/t" not in names(core)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_close_that_the_master_missed_is_repeated(core: Core, master: HoldingMaster, kind: str) -> None:
+    """Else others would look for the topic or service at this node for as long as that runs."""
+    master.release()
+    async with node_at(master) as node, asyncio.timeout(60):
+        handle: Any = await KINDS[kind](node)
+        master.failures = 1
+        with pytest.raises(MasterUnreachableError):
+            await handle.close()
         await until_called(master, [f"register{kind}", f"unregister{kind}"])
         assert "/t" not in names(core)
 
