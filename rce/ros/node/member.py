@@ -337,6 +337,8 @@ class GraphMember:
                 await self._running.registrations.take_back_abandoned()
         except (MasterError, TimeoutError) as error:
             _log.info("%s left without telling its master: %s", self.name, str(error) or "it took too long")
+        finally:
+            self._topics.disconnect()
         self._running.registrations.close()
         for client in list(self._clients):
             await client.close()

@@ -90,6 +90,8 @@ class TopicOutput:
         self.registration: Registration
         self.lost = 0
         """Messages dropped on links that are gone."""
+        self.is_closed = False
+        """Whether it takes no subscribers any more."""
         self.changed = asyncio.Event()
         self.node_name = runtime.name
         self._runtime = runtime
@@ -169,6 +171,7 @@ class TopicOutput:
 
     def close(self) -> None:
         """Close all links."""
+        self.is_closed = True
         for link in self.links:
             link.connection.close()
         for local in self.local_links:

@@ -227,7 +227,7 @@ class TopicInput:
 
     async def _receive_locally(self, uri: str, neighbour: Topics) -> None:
         output = neighbour.outputs.get(self.topic)
-        if output is None:
+        if output is None or output.is_closed:
             raise TcprosError(f"{uri} does not offer {self.topic}")
         link = LocalLink(
             self,

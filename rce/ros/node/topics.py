@@ -130,6 +130,11 @@ class Topics:
             raise
         return subscriber
 
+    def disconnect(self) -> None:
+        """Disconnect all subscribers as the node leaves; links within the process end in no other way."""
+        for output in self.outputs.values():
+            output.close()
+
     def _remove_publisher(self, output: TopicOutput, publisher: Publisher) -> bool:
         """Remove a handle; return whether it was the last one, with which the topic is removed."""
         if publisher not in output.publishers:  # closed while it waited for the master

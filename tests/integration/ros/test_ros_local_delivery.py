@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import AsyncExitStack
 from functools import partial
 
 import pytest
@@ -128,3 +129,22 @@ async def test_publishers_come_and_go(near: MakeNode) -> None:
         async with near("a") as a:
             publisher = await a.advertise("t", STRING)
             assert publisher.connections == 0
+
+
+async def test_publisher_that_leaves_without_a_core_is_gone() -> None:
+    """Its subscribers in this process have no connection that would end."""
+    async with AsyncExitStack() as listening:
+        async with Core(port=0) as core, AsyncExitStack() as talking:
+            a, b = (Node(name, argv=[], master_uri=core.uri) for name in ("a", "b"))
+            await listening.enter_async_context(b)
+            heard = await b.subscribe("t", STRING)
+            await talking.enter_async_context(a)
+            publisher = await a.advertise("t", STRING)
+            await heard.wait_for_publishers(timeout=10)
+            publisher.publish(data="last")
+            leaving = talking.pop_all()
+        await leaving.aclose()
+        async with asyncio.timeout(10):
+            assert (await anext(aiter(heard))).data == "last"
+            while heard.connections:
+                await asyncio.sleep(0.01)
