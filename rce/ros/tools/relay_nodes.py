@@ -2,7 +2,7 @@
 
 ``relay IN [OUT]`` publishes a topic under another name; ``throttle messages IN HZ [OUT]`` and
 ``throttle bytes IN BYTES_PER_SECOND WINDOW [OUT]`` leave messages out. With the parameter ``~lazy`` they take
-messages only while the output has subscribers.
+messages only while the output has subscribers; with ``~wall_clock``, a throttle does not count in ROS time.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ async def _serve(name: str, source: str, target: str, chosen: Throttle | None) -
     try:
         async with Node(f"{base}_{name}", anonymous=True) as node:
             lazy = bool(await node.get_param("~lazy", default=False))
-            work = asyncio.ensure_future(TopicRelay(source, target, throttle=chosen, lazy=lazy).run(node))
+            wall_clock = bool(await node.get_param("~wall_clock", default=False))
+            relay = TopicRelay(source, target, throttle=chosen, lazy=lazy, wall_clock=wall_clock)
+            work = asyncio.ensure_future(relay.run(node))
             stopped = asyncio.ensure_future(node.spin())
             await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
             stopped.cancel()

@@ -16,7 +16,8 @@ from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
-from rce.ros.node import Publisher, Subscriber
+from rce.ros.node import Node, Publisher, Subscriber
+from rce.ros.types import Time
 
 
 @pytest.fixture
@@ -26,11 +27,11 @@ async def core() -> AsyncIterator[Core]:
 
 
 @asynccontextmanager
-async def relaying(core: Core, relay: TopicRelay) -> AsyncIterator[None]:
+async def relaying(core: Core, relay: TopicRelay) -> AsyncIterator[Node]:
     async with node("relay", core.uri) as relayer:
         task = asyncio.create_task(relay.run(relayer))
         try:
-            yield
+            yield relayer
         finally:
             task.cancel()
             await asyncio.wait([task])
@@ -116,6 +117,32 @@ async def test_a_throttled_relay_holds_back(core: Core) -> None:
             while relay.held_back < 4:
                 await asyncio.sleep(0.02)
         assert relay.passed == 1
+
+
+@pytest.mark.parametrize("wall_clock", [False, True])
+async def test_throttle_counts_in_simulated_time(core: Core, wall_clock: bool) -> None:
+    """As topic_tools' throttle does, and with ``wall_clock`` not."""
+    core.set_param("/use_sim_time", True)
+    relay = TopicRelay("from", "to", throttle=MessageThrottle(0.001), wall_clock=wall_clock)
+    async with (
+        asyncio.timeout(60),
+        node("talker", core.uri) as talker,
+        node("listener", core.uri) as listener,
+        relaying(core, relay) as relayer,
+    ):
+        clock = await talker.advertise("/clock", "rosgraph_msgs/Clock", latch=True)
+        publisher = await talker.advertise("from", STRING)
+        heard = await listener.subscribe("to", STRING)
+        clock.publish(clock=Time(1))
+        assert (await published_until_heard(publisher, heard, data="first")).data == "first"
+        clock.publish(clock=Time(2000))
+        while relayer.time() < 2000:
+            await asyncio.sleep(0.01)
+        held_back = relay.held_back
+        publisher.publish(data="second")
+        while relay.passed + relay.held_back == 1 + held_back:
+            await asyncio.sleep(0.01)
+        assert relay.passed == (1 if wall_clock else 2)
 
 
 async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:

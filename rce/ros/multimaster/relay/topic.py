@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 
 from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.relay.kinds import TopicKind, learn_topic
@@ -37,6 +38,7 @@ class TopicRelay:
         throttle: Throttle | None = None,
         latch: bool = False,
         lazy: bool = False,
+        wall_clock: bool = False,
     ) -> None:
         """Prepare a relay.
 
@@ -46,6 +48,7 @@ class TopicRelay:
             throttle: Decides which messages are passed on; None: all.
             latch: Keep the last message for later subscribers. Without it, latched messages stay latched.
             lazy: Take messages only while the target has subscribers.
+            wall_clock: The throttle counts in the machine's time, also where ROS time is simulated.
         """
         self.passed = 0
         self.held_back = 0
@@ -54,8 +57,10 @@ class TopicRelay:
         self._throttle = throttle or Everything()
         self._latch = latch
         self._lazy = lazy
+        self._wall_clock = wall_clock
         self._idle = asyncio.Event()
         self._publisher: Publisher
+        self._now: Callable[[], float]
 
     async def run(self, node: Node) -> None:
         """Relay until cancelled.
@@ -67,6 +72,8 @@ class TopicRelay:
         source, target = node.resolve(self._source), node.resolve(self._target)
         if source == target:
             raise ValueError(f"{source} cannot be relayed to itself")
+        is_simulated = node.is_time_simulated and not self._wall_clock
+        self._now = node.time if is_simulated else asyncio.get_running_loop().time
         kind = await self._learn(node, source)
         self._publisher = await node.advertise(target, kind.as_type(), latch=self._latch, queue_size=QUEUE)
         while True:
@@ -101,7 +108,7 @@ class TopicRelay:
         if self._lazy and self._publisher.connections == 0:
             self._idle.set()
             return
-        if self._throttle.passes(asyncio.get_running_loop().time(), len(payload)):
+        if self._throttle.passes(self._now(), len(payload)):
             self.passed += 1
             self._publisher.publish_serialized(payload, latch=latched, source="" if self._latch else source)
         else:
