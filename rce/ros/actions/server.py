@@ -206,6 +206,7 @@ class ActionServer:
             IllegalTransitionError: It is not possible in the goal's state.
             SerializationError: The result does not fit its type; nothing was changed.
         """
+        text = text.encode(errors="backslashreplace").decode()  # it is part of all later lists of goals
         content = self._result.type.new(result={} if result is None else result)
         self._result.type.serialize(content)
         self._ledger.apply(entry.goal_id.id, event, self._time(), text)

@@ -135,10 +135,12 @@ class Service:
 
     def _failure(self, error: BaseException) -> Chunks:
         if isinstance(error, ServiceFaultError):
-            return answer_frame(error.text.encode(), ok=False)
-        _log.error("service %s failed", self.name, exc_info=error)
-        text = f"error processing request: {str(error) or type(error).__name__}"
-        return answer_frame(text.encode(), ok=False)
+            text = error.text
+        else:
+            _log.error("service %s failed", self.name, exc_info=error)
+            text = f"error processing request: {str(error) or type(error).__name__}"
+        # The name of a file, or a text from JSON, may hold what UTF-8 cannot.
+        return answer_frame(text.encode(errors="backslashreplace"), ok=False)
 
 
 class Session:

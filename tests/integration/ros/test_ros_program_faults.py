@@ -92,6 +92,29 @@ async def test_handler_awaiting_a_cancelled_task_answers_with_an_error(make_node
         assert (await client.call({}, timeout=10)).success
 
 
+@pytest.mark.parametrize("is_async", [True, False])
+@pytest.mark.parametrize("kind", [ServiceFaultError, ValueError])
+async def test_error_text_that_utf8_cannot_hold_is_escaped(
+    make_node: MakeNode, is_async: bool, kind: type[Exception]
+) -> None:
+    """As the name of a file that was made elsewhere; the node continues."""
+    text = "no map caf\udce9"
+    error = ServiceFaultError("/go", text) if kind is ServiceFaultError else kind(text)
+
+    def fail(request: Message) -> dict[str, Any]:
+        raise error
+
+    async def fail_later(request: Message) -> dict[str, Any]:
+        raise error
+
+    async with make_node("a") as a, make_node("b") as b:
+        await a.advertise_service("go", TRIGGER, fail_later if is_async else fail)
+        for _ in range(2):
+            with pytest.raises(ServiceFaultError, match=r"no map caf\\udce9"):
+                await b.service_client("go", TRIGGER).call({}, timeout=10)
+        assert not a.is_shutdown
+
+
 async def test_timer_awaiting_a_cancelled_task_calls_again(make_node: MakeNode) -> None:
     async with make_node("a") as a:
         calls: asyncio.Queue[TimerEvent] = asyncio.Queue()

@@ -189,6 +189,18 @@ async def test_a_handler_that_fails_aborts_its_goal(
             await client.send(order="many")
 
 
+async def test_error_text_that_utf8_cannot_hold_ends_only_its_goal(make_node: MakeNode) -> None:
+    async def fail(goal: ServerGoal) -> dict[str, Any]:
+        if goal.request.order:
+            raise ValueError("no map caf\udce9")
+        return {"sequence": [1]}
+
+    async with pair(make_node, fail) as (_, client):
+        with pytest.raises(GoalFailedError, match=r"aborted: ValueError: no map caf\\udce9"):
+            await (await client.send(order=1)).result()
+        assert list((await (await client.send(order=0)).result()).sequence) == [1]
+
+
 async def test_a_simple_server_works_on_the_newest_goal(make_node: MakeNode) -> None:
     async with pair(make_node, until_cancelled, server=SimpleActionServer) as (server, client):
         first = await client.send(order=1)
