@@ -94,7 +94,8 @@ def issue(authority: Issued, name: str, hosts: Iterable[str], days: float = CERT
         days: How long it is valid; it ends with the authority at the latest.
 
     Raises:
-        CertificateError: The authority cannot be read, or a host is neither a name nor an address.
+        CertificateError: The authority cannot be read or has expired, or a host is neither a name nor an
+            address.
     """
     try:
         signer = x509.load_pem_x509_certificate(authority.certificate)
@@ -104,6 +105,11 @@ def issue(authority: Issued, name: str, hosts: Iterable[str], days: float = CERT
     if not isinstance(signing_key, ec.EllipticCurvePrivateKey):
         raise CertificateError(
             "the authority's key is not an elliptic curve's, as rce certificate init makes it"
+        )
+    if signer.not_valid_after_utc <= datetime.now(UTC):
+        raise CertificateError(
+            f"the authority has expired on {signer.not_valid_after_utc:%Y-%m-%d}, and its certificates"
+            " would be refused: make a new one (docs/how-to/tls.md)"
         )
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (

@@ -298,7 +298,7 @@ def _read(file: Path) -> bytes:
 
 
 def _write_private(file: Path, content: bytes) -> None:
-    """Write a file atomically that only its owner may read.
+    """Write a file atomically that only its owner may read; it is whole also after a loss of power.
 
     A file that is replaced keeps its owner: services run as a user of their own, and root renews for them.
     """
@@ -309,6 +309,8 @@ def _write_private(file: Path, content: bytes) -> None:
         descriptor = os.open(aside, flags, 0o600)
         with os.fdopen(descriptor, "wb") as output:
             output.write(content)
+            output.flush()
+            os.fsync(descriptor)
             if os.geteuid() == 0 and (owner := _owner_of(file)) is not None:
                 os.fchown(descriptor, *owner)
         aside.replace(file)

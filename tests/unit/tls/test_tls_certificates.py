@@ -108,6 +108,34 @@ def test_certificate_ends_with_its_authority() -> None:
     assert 1 < found.days_left() <= 2
 
 
+@pytest.mark.parametrize("days", [-0.01, -100])
+def test_expired_authority_issues_nothing(tmp_path: Path, days: float) -> None:
+    """Also not for ``rce up``, which renews by itself."""
+    folder = CertificateFolder(tmp_path / "certificates")
+    folder.make_authority(days)
+    with pytest.raises(CertificateError, match=r"the authority has expired on .*: make a new one"):
+        folder.issue("cloud")
+    with pytest.raises(CertificateError, match="the authority has expired on"):
+        folder.ensure("engine", ["a.example"])
+    assert not folder.has("cloud")
+
+
+def test_files_are_on_the_disk_before_they_replace_others(
+    folder: CertificateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    replace = Path.replace
+
+    def note(file: Path, to: Path) -> Path:
+        done.append(to.name)
+        return replace(file, to)
+
+    monkeypatch.setattr(os, "fsync", lambda _: done.append("written"))
+    monkeypatch.setattr(Path, "replace", note)
+    folder.issue("cloud")
+    assert done == ["written", "issued.jsonl", "written", "cloud.key", "written", "cloud.pem"]
+
+
 def test_ensure_makes_renews_and_adds_hosts(folder: CertificateFolder, tmp_path: Path) -> None:
     fresh = CertificateFolder(tmp_path / "fresh")
     assert "made an authority" in fresh.ensure("engine", ["a.example"])
