@@ -8,7 +8,7 @@ is done by :mod:`rce_fleet.navigation.exploration`.
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce.ros.actions import ActionClient, ClientGoal, GoalState
-from rce.ros.node import Message, Node, Publisher, run
+from rce.ros.node import Message, Node, NodeClosedError, Publisher, run
 from rce.ros.tf import TransformError, TransformListener
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import MapError
@@ -116,10 +116,11 @@ class ExploreNode:
             )
             await node.subscribe("explore/resume", "std_msgs/Bool", self._resume)
             self._tell(STARTED)
-            while not node.is_shutdown:
-                await self._step()
-                diagnostics.publish(*self._state())
-                await self._pause(1 / parameters.planner_frequency)
+            with suppress(NodeClosedError):  # told to stop while it waited for move_base
+                while not node.is_shutdown:
+                    await self._step()
+                    diagnostics.publish(*self._state())
+                    await self._pause(1 / parameters.planner_frequency)
 
     async def _pause(self, seconds: float) -> None:
         """Wait for the next decision; one is due at once when a goal ends or the exploration is resumed."""

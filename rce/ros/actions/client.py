@@ -9,7 +9,7 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from rce.aio.tasks import TaskScope
+from rce.aio.tasks import TaskScope, run_until_first
 from rce.ros.actions import topics
 from rce.ros.actions.client_goal import ChangeCallback, ClientGoal, FeedbackCallback
 from rce.ros.actions.exceptions import IllegalTransitionError
@@ -17,6 +17,7 @@ from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker, SilenceClock
 from rce.ros.closing import release
+from rce.ros.errors import NodeClosedError
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Subscriber
@@ -122,9 +123,13 @@ class ActionClient:
 
         Raises:
             TimeoutError: No server was connected within ``timeout`` seconds.
+            NodeClosedError: The node was told to stop.
         """
         async with asyncio.timeout(timeout):
-            await self._heard.wait()
+            if not self._heard.is_set():
+                await run_until_first(self._heard.wait(), self._node.until_shutdown())
+                if not self._heard.is_set():
+                    raise NodeClosedError(f"node {self._node.name} was told to stop")
             await self._goal.wait_for_subscribers()
             await self._cancel.wait_for_subscribers()
             for subscriber in self._inputs:
@@ -149,6 +154,7 @@ class ActionClient:
 
         Raises:
             SerializationError: A value does not fit its field.
+            NodeClosedError: The node was told to stop.
         """
         if goal is not None and fields:
             raise TypeError("give a goal or its fields, not both")

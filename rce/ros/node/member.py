@@ -129,14 +129,17 @@ class GraphMember:
         return self._stop.is_set()
 
     def shutdown(self, reason: str = "the program asked for it") -> None:
-        """Tell the node to stop: iterators, :meth:`spin` and :meth:`sleep` end."""
+        """Tell the node to stop: iterators, :meth:`spin`, :meth:`sleep` and waits for other nodes end."""
         if not self._stop.is_set():
             _log.info("%s stops: %s", self.name, reason)
             self._stop.set()
             self._clock.end()
             for source in self._topics.inputs.values():
+                source.changed.set()
                 for subscriber in source.subscribers:
                     subscriber.sink.end()
+            for output in self._topics.outputs.values():
+                output.changed.set()
 
     def _stop_for_others(self, reason: str) -> None:
         """Stop because another program says so, such as the core when a second node takes this one's name."""
@@ -213,6 +216,7 @@ class GraphMember:
                 Registrations(self.name, tasks),
                 scratch,
                 intra_process=self._intra_process,
+                stopping=self._stop,
             )
             self._parameters = Parameters(master)
             if self._intra_process:

@@ -290,11 +290,13 @@ class Node(GraphMember):
         Raises:
             TimeoutError: No provider answered within ``timeout`` seconds.
             MasterError: The master cannot be asked.
+            NodeClosedError: The node was told to stop.
         """
         runtime, service = self._running, self.resolve(name)
         async with asyncio.timeout(timeout):
-            while not await answers(runtime, service):  # noqa: ASYNC110 - a master announces no services
-                await asyncio.sleep(SERVICE_POLL)
+            while not await answers(runtime, service):
+                runtime.check_running()
+                await asyncio.sleep(SERVICE_POLL)  # a master announces no services
 
     # Time
 

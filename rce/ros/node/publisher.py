@@ -177,6 +177,17 @@ class TopicOutput:
         for local in self.local_links:
             local.end()
 
+    async def until_linked(self, count: int) -> None:
+        """Wait until there are at least ``count`` subscribers.
+
+        Raises:
+            NodeClosedError: The node was told to stop.
+        """
+        while len(self.all_links) < count:
+            self._runtime.check_running()
+            self.changed.clear()
+            await self.changed.wait()
+
     @property
     def all_links(self) -> list[Link | LocalLink]:
         """The subscribers of either sort."""
@@ -306,12 +317,10 @@ class Publisher:
 
         Raises:
             TimeoutError: They did not come within ``timeout`` seconds.
+            NodeClosedError: The node was told to stop.
         """
-        output = self._output
         async with asyncio.timeout(timeout):
-            while len(output.all_links) < count:
-                output.changed.clear()
-                await output.changed.wait()
+            await self._output.until_linked(count)
 
     async def close(self) -> None:
         """Stop publishing; the last publisher of a topic unregisters it and disconnects its subscribers."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce.aio.tasks import TaskScope
+from rce.ros.errors import NodeClosedError
 from rce.ros.node.master import MasterClient
 from rce.ros.node.registrations import Registrations
 from rce.ros.xmlrpc import RpcClient
@@ -61,3 +63,14 @@ class Runtime:
     """Read buffer of all TCPROS connections."""
     intra_process: bool
     """Whether messages of nodes in this process are taken as objects."""
+    stopping: asyncio.Event
+    """Set when the node is told to stop."""
+
+    def check_running(self) -> None:
+        """Check that the node continues: a wait that has no time limit would never end.
+
+        Raises:
+            NodeClosedError: It was told to stop.
+        """
+        if self.stopping.is_set():
+            raise NodeClosedError(f"node {self.name} was told to stop")

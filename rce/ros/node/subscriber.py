@@ -249,6 +249,7 @@ class Subscriber:
         release: Callable[[Subscriber], Awaitable[None]],
         connected: Callable[[], int],
         changed: asyncio.Event,
+        check_running: Callable[[], None],
         *,
         decodes: bool,
         hears_own: bool,
@@ -265,6 +266,7 @@ class Subscriber:
         self._release = release
         self._connected = connected
         self._changed = changed
+        self._check_running = check_running
         self._closed = False
 
     @property
@@ -282,9 +284,11 @@ class Subscriber:
 
         Raises:
             TimeoutError: They did not come within ``timeout`` seconds.
+            NodeClosedError: The node was told to stop.
         """
         async with asyncio.timeout(timeout):
             while self._connected() < count:
+                self._check_running()
                 self._changed.clear()
                 await self._changed.wait()
 

@@ -116,6 +116,7 @@ class Topics:
             release,
             source.connected,
             source.changed,
+            runtime.check_running,
             decodes=decodes,
             hears_own=hears_own,
         )

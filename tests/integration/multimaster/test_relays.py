@@ -101,6 +101,16 @@ async def test_a_lazy_relay_listens_only_while_it_has_a_subscriber(core: Core) -
                 await asyncio.sleep(0.02)
 
 
+async def test_lazy_relay_that_waits_ends_with_its_node(core: Core) -> None:
+    relay = TopicRelay("from", "to", lazy=True)
+    async with asyncio.timeout(30), node("talker", core.uri) as talker, node("relay", core.uri) as relayer:
+        await talker.advertise("from", STRING)
+        task = asyncio.create_task(relay.run(relayer))
+        await core.wait_until(lambda graph: bool(graph.publishers("/to")))
+        relayer.shutdown("the test says so")
+        await task
+
+
 async def test_a_throttled_relay_holds_back(core: Core) -> None:
     relay = TopicRelay("from", "to", throttle=MessageThrottle(0.01))
     async with (

@@ -279,6 +279,25 @@ async def test_a_goal_that_others_cancel_pauses(parts: Parts, caplog: pytest.Log
         await judge.until(lambda: "publish true on /explore/resume" in caplog.text)
 
 
+async def test_node_that_waits_for_move_base_ends_when_told(parts: Parts) -> None:
+    async with Core(port=0) as core, asyncio.TaskGroup() as tasks:
+        parts.uri = core.uri
+        judge = Judge(await parts.node("judge"))
+        await judge.listen()
+        maps = await judge.node.advertise("map", "nav_msgs/OccupancyGrid", latch=True)
+        async with StaticTransformBroadcaster(judge.node) as frames:
+            frames.send("map", "base_link", Transform.make(1.0, 1.0))
+            explorer = await parts.node("explore")
+            running = tasks.create_task(
+                ExploreNode(explorer, explore_parameters(planner_frequency=10.0)).run()
+            )
+            maps.publish(**map_fields(half_hall(20), "map", Time.now()))
+            await judge.until(lambda: explore.IN_PROGRESS in judge.statuses)
+            explorer.shutdown("the test says so")
+            async with asyncio.timeout(30):
+                await running
+
+
 async def test_bad_maps_are_told_and_the_node_lives(parts: Parts, caplog: pytest.LogCaptureFixture) -> None:
     script = Scripted()
     async with Core(port=0) as core, script.beside(parts, core) as judge:

@@ -115,6 +115,24 @@ async def test_error_text_that_utf8_cannot_hold_is_escaped(
         assert not a.is_shutdown
 
 
+@pytest.mark.parametrize("wait", ["service", "subscribers", "publishers"])
+async def test_waiting_for_others_ends_when_the_node_is_told_to_stop(make_node: MakeNode, wait: str) -> None:
+    """Else a program that is interrupted meanwhile would have to be killed, and stay registered."""
+    async with make_node("a") as a, asyncio.timeout(10):
+        publisher, subscriber = await a.advertise("t", STRING), await a.subscribe("u", STRING)
+        waits = {
+            "service": lambda: a.wait_for_service("s"),
+            "subscribers": publisher.wait_for_subscribers,
+            "publishers": subscriber.wait_for_publishers,
+        }
+        waiting = asyncio.ensure_future(waits[wait]())
+        await asyncio.sleep(0.05)
+        a.shutdown("test")
+        for refused in (waiting, waits[wait]()):
+            with pytest.raises(NodeClosedError, match="node /a was told to stop"):
+                await refused
+
+
 async def test_timer_awaiting_a_cancelled_task_calls_again(make_node: MakeNode) -> None:
     async with make_node("a") as a:
         calls: asyncio.Queue[TimerEvent] = asyncio.Queue()

@@ -20,6 +20,7 @@ from rce.ros.errors import (
     TypeMismatchError,
 )
 from rce.ros.node import ServiceClient
+from rce.ros.node.master import MasterClient
 from rce.ros.tcpros.framing import answer_frame
 from rce.ros.tcpros.header import decode_header, encode_header
 from rce.ros.types import Message, SerializationError, TypeRegistry
@@ -198,12 +199,13 @@ async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: 
 
 async def test_a_dead_registration_is_reported_as_lost(core: Core, make_node: MakeNode) -> None:
     async with make_node("b") as b:
-        await b._running.master.call("registerService", "/s", "rosrpc://127.0.0.1:1", "http://127.0.0.1:1/")
+        dead = MasterClient(core.uri, "/dead", "http://127.0.0.1:1/", b._running.rpc)
+        await dead.register_service("/s", "rosrpc://127.0.0.1:1")
         with pytest.raises(ServiceLostError):
             await b.service_client("s", SET_BOOL)(data=True)
         with pytest.raises(TimeoutError):
             await b.wait_for_service("s", timeout=0.3)
-        core.forget_node("/b")
+        core.forget_node("/dead")
 
 
 async def test_types_must_agree(make_node: MakeNode) -> None:

@@ -24,6 +24,7 @@ from rce.ros.actions import (
 from rce.ros.actions.ledger import Arrival
 from rce.ros.actions.work import Handler
 from rce.ros.core import Core
+from rce.ros.errors import NodeClosedError
 from rce.ros.types import Message, SerializationError, Time
 
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
@@ -352,6 +353,15 @@ async def test_waiting_has_an_end(make_node: MakeNode) -> None:
         with pytest.raises(TimeoutError):
             await goal.result(0.01)
         assert not goal.is_done
+
+
+async def test_waiting_for_a_server_ends_with_the_node(make_node: MakeNode) -> None:
+    async with make_node("client") as b, ActionClient(b, "job", FIBONACCI) as client, asyncio.timeout(10):
+        waiting = [asyncio.ensure_future(one) for one in (client.wait_for_server(), client.send(order=1))]
+        await asyncio.sleep(0.05)
+        b.shutdown("test")
+        outcomes = await asyncio.gather(*waiting, return_exceptions=True)
+        assert [type(outcome) for outcome in outcomes] == [NodeClosedError] * 2
 
 
 async def test_goals_end_for_a_client_that_leaves_or_whose_node_stops(make_node: MakeNode) -> None:

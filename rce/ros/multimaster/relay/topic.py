@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
+from rce.ros.errors import NodeClosedError
 from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.relay.kinds import TopicKind, learn_topic
 from rce.ros.multimaster.relay.throttle import Everything, Throttle
@@ -63,7 +64,7 @@ class TopicRelay:
         self._now: Callable[[], float]
 
     async def run(self, node: Node) -> None:
-        """Relay until cancelled.
+        """Relay until cancelled, or until the node is told to stop while there are no subscribers.
 
         Raises:
             MasterError: The master does not answer any longer.
@@ -78,7 +79,10 @@ class TopicRelay:
         self._publisher = await node.advertise(target, kind.as_type(), latch=self._latch, queue_size=QUEUE)
         while True:
             if self._lazy:
-                await self._publisher.wait_for_subscribers()
+                try:
+                    await self._publisher.wait_for_subscribers()
+                except NodeClosedError:
+                    return
             self._idle.clear()
             subscriber = await node.listen(source, kind.as_type(), self)
             await self._idle.wait()
