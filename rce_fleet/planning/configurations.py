@@ -157,7 +157,7 @@ class ConfigurationSearch:
             node.focus = self._focus(node)
         for place, choice in constraint:
             robot = int(node.focus[place])
-            ways = self._ways(int(node.cells[robot]))
+            ways = self._ways(robot, int(node.cells[robot]))
             if choice >= len(ways):
                 return 0
             fixed[robot] = ways[choice]
@@ -170,8 +170,10 @@ class ConfigurationSearch:
         most = int(np.diff(self._graph.indptr).max(initial=0)) + 1
         return [(*constraint, (len(constraint), int(choice))) for choice in self._rng.permutation(most)]
 
-    def _ways(self, node: int) -> list[int]:
-        return [*self._graph.edges_from(node).tolist(), node]
+    def _ways(self, robot: int, node: int) -> list[int]:
+        """Return the nodes that a robot can be in next: those from which it reaches its goal, and its own."""
+        ways = self._graph.edges_from(node)
+        return [*ways[self._table[robot, ways] < far_of(self._table)].tolist(), node]
 
     def _focus(self, node: _Node) -> Ints:
         """Order robots to be constrained: those away from their goals, then those near to them.

@@ -188,6 +188,7 @@ def _next_nodes(
                 partner = stack[depth, 3]
                 here = now[robot]
                 is_open = partner >= 0 and after[partner] == OPEN and taken[here] < 0
+                is_open = is_open and table[partner, here] < far  # else it must not enter that node
                 if is_open and stack[depth, 2] == 1 and _has_edge(indptr, neighbours, now[partner], here):
                     after[partner] = here
                     taken[here] = partner

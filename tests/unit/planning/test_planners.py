@@ -13,8 +13,10 @@ from rce_fleet.planning.dijkstra import distances
 from rce_fleet.planning.fields import UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import Edge, PlanningGraph
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.motion import Motion
+from rce_fleet.planning.motion import Motion, Turning
+from rce_fleet.planning.pibt import roll_out
 from rce_fleet.planning.planner import JointPlan, PlanningProblem, load_planner, planner_names
+from rce_fleet.planning.swap import OPEN
 
 
 def test_both_planners_are_installed() -> None:
@@ -40,6 +42,34 @@ def test_a_planner_avoids_walls_and_forbidden_cells(name: str) -> None:
     joint = load_planner(name).plan(problem)
     assert joint.complete
     assert joint.path(0) == [0, 3, 6, 7, 8]
+
+
+@pytest.mark.parametrize(("barred", "complete"), [((0,), True), ((0, 1), False)])
+def test_robots_do_not_pass_in_a_forbidden_bay(barred: tuple[int, ...], complete: bool) -> None:
+    """Two robots change places in an aisle with one bay, which one of them or none may enter."""
+    grid, bay = GridMap(2, 3, blocked=frozenset({3, 5})), 4
+    forbidden = {robot: frozenset({bay}) for robot in barred}
+    problem = PlanningProblem.of(PlanningGraph.from_grid(grid), [0, 2], [2, 0], forbidden=forbidden)
+    joint = load_planner("lacam").plan(problem)
+    assert (joint.complete, joint.impossible) == (complete, not complete)
+    assert not any(bay in joint.cells[:, robot] for robot in barred)
+
+
+@pytest.mark.parametrize(("forbidden", "entered"), [({}, 5), ({1: frozenset({5})}, 6)])
+def test_a_robot_is_not_pulled_into_a_forbidden_cell(
+    forbidden: dict[int, frozenset[int]], entered: int
+) -> None:
+    """Robot 0 goes back in an aisle to get past robot 1, which stands at its goal and follows it."""
+    grid = GridMap(3, 4, blocked=frozenset({1, 2, 3, 9, 10, 11}))
+    graph, goals = PlanningGraph.from_grid(grid), np.array([7, 6], np.int32)
+    rows, zeros = np.array([[5, 6], [0, 0]], np.int32), np.zeros((2, 2), np.int32)
+    table = distance_fields(graph, goals, forbidden, rows[0])
+    roll_out(
+        graph.indptr, graph.neighbours, table, int(UNREACHABLE), goals, np.full(2, OPEN, np.int32), rows,
+        zeros.copy(), np.arange(2, dtype=np.int32), 0, zeros.copy(), *Turning.none(2).arrays,
+        np.array([1], np.int64),
+    )  # fmt: skip
+    assert rows[1].tolist() == [4, entered]
 
 
 def test_dijkstra_does_not_promise_freedom_of_conflicts() -> None:
