@@ -46,8 +46,8 @@ DEFAULT_EFFORT = 40_000
 """How many single-robot moves :func:`plan` tries before it gives up."""
 _MAX_IMPROVED = 150_000_000
 """Entries of the table of distances up to which a plan is improved; larger ones take too much memory."""
-
-
+_MAX_STRAIGHTENED = 20_000_000
+"""Steps times nodes up to which loops are cut out of a plan; four bytes each."""
 _GUIDED_FROM = 0.005
 """Robots by node from which on the first plan follows guidance in aisles; a few robots have room anyway."""
 _RESTARTS = 0.15
@@ -97,8 +97,8 @@ class LacamPlanner:
             return self._plan_in_motion(part, problem, problem.motion, guide, began + problem.seconds)
         deadline = began + problem.seconds
         cells, complete, impossible = _first(part, problem, guide, deadline)
-        if not problem.rotations and cells.size * len(part.graph) < _MAX_IMPROVED * 16:
-            straighten(cells, len(part.graph), ends_of(cells, part.goals, lifelong=problem.lifelong))
+        if not problem.rotations:
+            _cut_loops(part, problem, cells)
         joint = JointPlan(part.original(cells), complete, impossible=impossible)
         if self._on_first is not None and complete:
             self._on_first(joint)
@@ -144,9 +144,8 @@ class LacamPlanner:
                             part.graph.unweighted, cells, part.goals, turning, stop=motion.stop,
                             rotations=problem.rotations, effort=smooth_effort, seed=seed,
                         )  # fmt: skip
-                    elif not problem.rotations and cells.size * len(part.graph) < _MAX_IMPROVED * 16:
-                        ends = ends_of(cells, part.goals, lifelong=problem.lifelong)
-                        straighten(cells, len(part.graph), ends)
+                    elif not problem.rotations:
+                        _cut_loops(part, problem, cells)
                     joint = JointPlan(part.original(cells), complete)
                     took = float(execution_times(joint.cells, problem.graph.columns, motion).sum())
                     took += problem.extra_cost(joint.cells)
@@ -193,6 +192,13 @@ def _table(part: Compaction, graph: PlanningGraph, own_costs: Mapping[int, Ints]
     if part.forbidden or own_costs:
         return distance_fields(graph, part.goals, part.forbidden, part.starts, own_costs)
     return field_table(graph, part.goals)
+
+
+def _cut_loops(part: Compaction, problem: PlanningProblem, cells: Ints) -> None:
+    """Cut loops out of a plan, unless that takes too much time or memory: it is right with them too."""
+    nodes = len(part.graph)
+    if cells.size * nodes < _MAX_IMPROVED * 16 and len(cells) * nodes <= _MAX_STRAIGHTENED:
+        straighten(cells, nodes, ends_of(cells, part.goals, lifelong=problem.lifelong))
 
 
 def _first(part: Compaction, problem: PlanningProblem, graph: PlanningGraph, deadline: float) -> _Found:

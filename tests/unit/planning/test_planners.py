@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -13,6 +14,7 @@ from rce_fleet.planning.dijkstra import distances
 from rce_fleet.planning.fields import UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import Edge, PlanningGraph
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lacam import LacamPlanner
 from rce_fleet.planning.motion import Motion, Turning
 from rce_fleet.planning.pibt import roll_out
 from rce_fleet.planning.planner import JointPlan, PlanningProblem, load_planner, planner_names
@@ -70,6 +72,20 @@ def test_a_robot_is_not_pulled_into_a_forbidden_cell(
         np.array([1], np.int64),
     )  # fmt: skip
     assert rows[1].tolist() == [4, entered]
+
+
+def test_a_long_way_on_a_large_map_takes_little_memory() -> None:
+    """A table of who is where and when has four bytes for each step and node, even with one robot."""
+    grid = GridMap(220, 220)
+    problem = PlanningProblem.of(PlanningGraph.from_grid(grid), [0], [len(grid) - 1])
+    tracemalloc.start()
+    try:
+        joint = LacamPlanner(compiled=False).plan(problem)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert joint.cost == 438
+    assert peak < 40e6
 
 
 def test_dijkstra_does_not_promise_freedom_of_conflicts() -> None:
