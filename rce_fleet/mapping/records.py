@@ -26,9 +26,9 @@ class LaserRecord:
     Attributes:
         index: Number of the scan in the log, from 0.
         time: When it was taken, seconds; times of a log may go backwards.
-        ranges: shape (N,), float64, metres, counter-clockwise; ``inf`` where nothing returned. N may be 0.
+        ranges: shape (N,), float64, metres; ``inf`` where nothing returned. N may be 0.
         angle_min: Direction of beam 0 in the laser's frame, radians.
-        angle_increment: Angle from one beam to the next, radians.
+        angle_increment: Angle from one beam to the next, radians; negative for a laser that is upside down.
         range_max: Greatest range the laser measures, metres.
         odometry: Dead reckoning ``(x, y, yaw)`` of the robot's base at that time.
         laser: Pose ``(x, y, yaw)`` of the laser on the base.

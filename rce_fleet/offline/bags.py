@@ -7,7 +7,7 @@ import struct
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import atan2, inf, isfinite, isnan
+from math import atan2, hypot, inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
@@ -40,12 +41,21 @@ _DAMAGED = (
 """What the library raises where a file is damaged."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Mount:
+    """A frame in its parent: its origin there, shape (3,), and its rotation, shape (3, 3)."""
+
+    parent: str
+    at: NDArray[np.float64]
+    turn: NDArray[np.float64]
+
+
 @dataclass(slots=True)
 class _Contents:
     scans: list[tuple[float, Any]] = field(default_factory=list)
     odometry: list[tuple[float, Pose]] = field(default_factory=list)
-    transforms: dict[str, tuple[str, Pose]] = field(default_factory=dict)
-    """Frame to its parent and its pose there."""
+    transforms: dict[str, _Mount] = field(default_factory=dict)
+    """Frames by their names."""
     base: str = ""
     faults: list[str] = field(default_factory=list)
 
@@ -54,8 +64,9 @@ def read_bag(path: Path, *, scan: str = "/scan", odometry: str = "/odom") -> Sca
     """Read the scans of a bag, each with the odometry at its time.
 
     Odometry is interpolated between the messages around a scan. The laser's pose on the base comes from
-    ``/tf_static`` or ``/tf``; without transforms the laser is at the base. Messages that cannot be used, and
-    what follows damage of the file, are left out and listed in ``faults`` of the result.
+    ``/tf_static`` or ``/tf``, and it may be upside down; without transforms the laser is at the base.
+    Messages that cannot be used, and what follows damage of the file, are left out and listed in ``faults``
+    of the result.
 
     Args:
         path: The bag.
@@ -154,6 +165,9 @@ def _take_scan(contents: _Contents, path: Path, message: Any) -> None:
             contents, f"{path}: the angles or limits of the scan at {stamp:.3f} s are not finite; left out"
         )
         return
+    if message.angle_increment == 0:
+        _fault(contents, f"{path}: angle_increment of the scan at {stamp:.3f} s is 0; left out")
+        return
     contents.scans.append((stamp, message))
 
 
@@ -170,12 +184,13 @@ def _take_odometry(contents: _Contents, path: Path, message: Any) -> None:
 def _take_transforms(contents: _Contents, path: Path, message: Any, *, is_static: bool) -> None:
     for each in message.transforms:
         child = each.child_frame_id.strip("/")
-        pose = _pose(each.transform.translation, each.transform.rotation)
-        if not all(map(isfinite, (pose.x, pose.y, pose.yaw))):
+        at, turn = each.transform.translation, _rotation(each.transform.rotation)
+        mount = _Mount(each.header.frame_id.strip("/"), np.array((at.x, at.y, at.z), np.float64), turn)
+        if not (np.isfinite(mount.at).all() and np.isfinite(mount.turn).all()):
             _fault(contents, f"{path}: a transform to {child!r} is not finite; left out")
             continue
         if is_static or child not in contents.transforms:
-            contents.transforms[child] = (each.header.frame_id.strip("/"), pose)
+            contents.transforms[child] = mount
 
 
 def _records(contents: _Contents, path: Path) -> list[LaserRecord]:
@@ -185,12 +200,12 @@ def _records(contents: _Contents, path: Path) -> list[LaserRecord]:
     for before, after in pairwise(contents.scans):
         if after[0] < before[0] - BACKWARDS_S:
             _fault(contents, f"{path}: the scan at {after[0]:.3f} s follows one at {before[0]:.3f} s")
-    lasers: dict[str, Pose] = {}
+    lasers: dict[str, tuple[Pose, float]] = {}
     for stamp, message in contents.scans:
         frame = message.header.frame_id.strip("/")
         if frame not in lasers:
             lasers[frame] = _laser(contents, path, frame)
-        laser = lasers[frame]
+        laser, side = lasers[frame]
         pose = _odometry_at(contents.odometry, times, stamp)
         ranges = np.asarray(message.ranges, np.float64)
         with np.errstate(invalid="ignore"):
@@ -200,8 +215,8 @@ def _records(contents: _Contents, path: Path) -> list[LaserRecord]:
                 index=len(records),
                 time=stamp,
                 ranges=np.where(seen, ranges, inf),
-                angle_min=float(message.angle_min),
-                angle_increment=float(message.angle_increment),
+                angle_min=side * float(message.angle_min),
+                angle_increment=side * float(message.angle_increment),
                 range_max=float(message.range_max),
                 odometry=(pose.x, pose.y, pose.yaw),
                 laser=(laser.x, laser.y, laser.yaw),
@@ -210,21 +225,25 @@ def _records(contents: _Contents, path: Path) -> list[LaserRecord]:
     return records
 
 
-def _laser(contents: _Contents, path: Path, frame: str) -> Pose:
-    """Return the pose of the laser's frame on the base; the frames between them are followed."""
-    pose, at = Pose(0.0, 0.0, 0.0), frame
+def _laser(contents: _Contents, path: Path, frame: str) -> tuple[Pose, float]:
+    """Return the pose of the laser's frame on the base, and -1 if it is upside down, else 1.
+
+    The frames between them are followed.
+    """
+    at, place, turn = frame, np.zeros(3), np.eye(3)
     for _ in range(len(contents.transforms) + 1):
         if at == contents.base or at not in contents.transforms:
             break
-        at, step = contents.transforms[at]
-        pose = step.compose(pose)
+        mount = contents.transforms[at]
+        at, place, turn = mount.parent, mount.at + mount.turn @ place, mount.turn @ turn
     if at == contents.base or not contents.transforms:
-        return pose
+        yaw = atan2(turn[1, 0], turn[0, 0])
+        return Pose(float(place[0]), float(place[1]), yaw), -1.0 if turn[2, 2] < 0 else 1.0
     _fault(
         contents,
         f"{path}: no transform from {contents.base!r} to {frame!r}; the laser is taken to be at the base",
     )
-    return Pose(0.0, 0.0, 0.0)
+    return Pose(0.0, 0.0, 0.0), 1.0
 
 
 def _odometry_at(odometry: Sequence[tuple[float, Pose]], times: Sequence[float], stamp: float) -> Pose:
@@ -249,3 +268,19 @@ def _seconds(stamp: Any) -> float:
 def _pose(position: Any, turn: Any) -> Pose:
     yaw = atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))
     return Pose(float(position.x), float(position.y), yaw)
+
+
+def _rotation(turn: Any) -> NDArray[np.float64]:
+    """Return the matrix of a quaternion, shape (3, 3); of one without a length, no rotation."""
+    values = (turn.x, turn.y, turn.z, turn.w)
+    length = hypot(*values)
+    if not length:
+        return np.eye(3)
+    x, y, z, w = (value / length for value in values)
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )

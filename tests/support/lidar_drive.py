@@ -72,9 +72,17 @@ def write_carmen(path: Path, records: list[LaserRecord]) -> None:
 
 
 def write_bag(
-    path: Path, records: list[LaserRecord], *, scan: str = "/scan", odometry: str = "/odom"
+    path: Path,
+    records: list[LaserRecord],
+    *,
+    scan: str = "/scan",
+    odometry: str = "/odom",
+    upside_down: bool = False,
 ) -> None:
-    """Write a ROS 1 bag: the laser stands in ``/tf_static``, odometry comes between the scans."""
+    """Write a ROS 1 bag: the laser stands in ``/tf_static``, odometry comes between the scans.
+
+    Upside down, the laser sees the same and counts its beams the other way round.
+    """
     store = typestore()
     kinds: Any = store.types
     transforms = kinds["tf2_msgs/msg/TFMessage"]
@@ -101,7 +109,9 @@ def write_bag(
 
         def step(time: float, parent: str, child: str, x: float) -> Any:
             moved = kinds["geometry_msgs/msg/Vector3"](x, 0.0, 0.0)
-            transform = kinds["geometry_msgs/msg/Transform"](moved, turn(0.0))
+            half = np.pi / 4 if upside_down else 0.0  # both steps roll by a quarter turn
+            rolled = kinds["geometry_msgs/msg/Quaternion"](sin(half), 0.0, 0.0, cos(half))
+            transform = kinds["geometry_msgs/msg/Transform"](moved, rolled)
             return kinds["geometry_msgs/msg/TransformStamped"](header(time, parent), child, transform)
 
         start = records[0].time
@@ -122,10 +132,12 @@ def write_bag(
                     header(each.time, "odom"), "base_link", with_covariance, twist
                 ),
             )
-            ranges = np.asarray(each.ranges, np.float32)
+            ranges, first = np.asarray(each.ranges, np.float32), each.angle_min
+            if upside_down:
+                ranges, first = ranges[::-1].copy(), -float(each.angles()[-1])
             scanned = kinds["sensor_msgs/msg/LaserScan"](
                 header(each.time, "laser"),
-                each.angle_min,
+                first,
                 -each.angle_min,
                 each.angle_increment,
                 0.0,

@@ -42,10 +42,9 @@ def seen_through(
         return np.zeros(len(points), np.bool_)
     local = transform_points(inverse(compose(pose, np.array(scan.laser))), points)
     distance = np.hypot(local[:, 0], local[:, 1])
-    angle = np.arctan2(local[:, 1], local[:, 0]) - scan.angle_min
-    if scan.angle_increment > 0:
-        angle = np.mod(angle, 2 * np.pi)
-    beam = np.round(angle / scan.angle_increment).astype(np.int64)
+    turn = np.sign(scan.angle_increment)  # the beams of a laser that is upside down go clockwise
+    angle = np.mod(turn * (np.arctan2(local[:, 1], local[:, 0]) - scan.angle_min), 2 * np.pi)
+    beam = np.round(angle / abs(scan.angle_increment)).astype(np.int64)
     inside = (beam >= 1) & (beam < beams - 1)
     beam = np.where(inside, beam, 1)
     around = np.stack([scan.ranges[beam + step] for step in (-1, 0, 1)])

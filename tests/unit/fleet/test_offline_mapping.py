@@ -92,6 +92,16 @@ def test_a_bag_has_the_records_that_were_written(tmp_path: Path) -> None:
         assert np.isclose(mine.time, other.time)
 
 
+def test_a_laser_of_a_bag_may_be_upside_down(tmp_path: Path) -> None:
+    _, records = drive(4, laser=FRONT)
+    write_bag(tmp_path / "run.bag", records, upside_down=True)
+    found = read_log(tmp_path / "run.bag")
+    assert found.faults == []
+    for mine, other in zip(records, found.records, strict=True):
+        assert other.angle_increment < 0
+        assert np.allclose(mine.points(), other.points()[::-1], atol=1e-4)
+
+
 def test_wrong_topics_of_a_bag_are_named(tmp_path: Path) -> None:
     write_bag(tmp_path / "run.bag", drive()[1], scan="/laser", odometry="/wheels")
     with pytest.raises(

@@ -16,6 +16,7 @@ from rce_fleet.mapping.graph.alignment import Reference, align
 from rce_fleet.mapping.graph.correlative import Window, find_match
 from rce_fleet.mapping.graph.fields import make_field, paint
 from rce_fleet.mapping.graph.scan_points import ScanPoints, prepare_scan
+from rce_fleet.mapping.graph.visibility import seen_through
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,3 +152,14 @@ def test_scan_leaves_out_what_is_no_range() -> None:
     scan = prepare_scan(record, farthest=30.0, cell=0.01)
     assert len(scan) == 176
     assert np.isfinite(scan.points).all()
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0], ids=["upright", "upside down"])
+def test_a_full_circle_from_0_sees_to_all_sides(turn: float) -> None:
+    """Upside down, its beams go clockwise from 0, so that those to the left come last."""
+    nothing, step = np.zeros((0, 2)), turn * np.pi / 180
+    scan = ScanPoints(nothing, nothing, np.full(360, 4.0, np.float32), 0.0, step)
+    around = np.deg2rad(np.arange(3, 358))
+    points = 2.0 * np.column_stack((np.cos(around), np.sin(around)))
+    assert seen_through(points, scan, np.zeros(3)).all()
+    assert not seen_through(2.5 * points, scan, np.zeros(3)).any()
