@@ -200,7 +200,9 @@ def _pixels(path: Path) -> NDArray[np.uint8] | NDArray[np.float64]:
             if image.mode in ("1", "L"):
                 return np.asarray(image.convert("L"), np.uint8)
             if not wide and image.mode not in ("LA", "RGB", "RGBA"):
-                pixels = np.asarray(image.convert("RGBA"), np.float64)
+                # An alpha channel counts as a colour: only an image that has transparency gets one.
+                mode = "RGBA" if image.has_transparency_data else "RGB"
+                pixels = np.asarray(image.convert(mode), np.float64)
             else:
                 pixels = np.asarray(image, np.float64)
     except UnidentifiedImageError as error:

@@ -78,6 +78,13 @@ def test_colours_and_transparent_pixels(tmp_path: Path) -> None:
     assert load_map(path).data.tolist() == [[100, 0, -1]]
 
 
+def test_a_palette_has_no_alpha_channel(tmp_path: Path) -> None:
+    """Programs that make images smaller save greys with a palette; unknown pixels stay unknown."""
+    path = write(tmp_path, [[0]], name="map.png")
+    Image.fromarray(np.array([[0, 205, 254]], np.uint8)).convert("P").save(tmp_path / "map.png")
+    assert load_map(path).data.tolist() == [[100, -1, 0]]
+
+
 @pytest.mark.parametrize(
     ("keys", "fault"),
     [
