@@ -112,7 +112,8 @@ def _size(drawn: OccupancyMap, place: Pose, cell_size: float) -> tuple[int, int]
 
 def _taken(drawn: OccupancyMap, place: Pose, cell_size: float, row: int, columns: int) -> NDArray[np.float64]:
     """Return the shares of a row's cells that are not free, shape (columns,), from evenly spaced points."""
-    points = min(max(floor(cell_size / drawn.resolution + 1e-6), 1), _MOST_POINTS)
+    # At most a pixel apart, so that no line of pixels lies between two of them.
+    points = min(max(ceil(cell_size / drawn.resolution - 1e-6), 1), _MOST_POINTS)
     inside = (np.arange(points) + 0.5) / points
     along = (np.arange(columns)[:, None] + inside).reshape(-1) * cell_size
     up = (row + inside) * cell_size

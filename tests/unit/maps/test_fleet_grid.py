@@ -38,6 +38,13 @@ def test_cells_are_blocked_by_their_share() -> None:
     assert fleet_grid(drawn(), 0.5).blocked == {2, 3, 8, 9, 23}
 
 
+def test_a_line_of_large_pixels_blocks_its_cells() -> None:
+    """It lies within 1.2 .. 1.5 m, where a cell of 1 m is blocked by a tenth."""
+    data = np.zeros((10, 10), np.int8)
+    data[:, 4] = 100
+    assert fleet_grid(OccupancyMap(data, 0.3)).blocked == {1, 4, 7}
+
+
 def test_cells_beyond_the_map_are_blocked() -> None:
     grid = fleet_grid(drawn(), origin=Pose(-2.0, 2.0, 0.0), rows=3, columns=5)
     assert grid.blocked == {0, 2, 4, 5, 9, 10, 11, 12, 13, 14}
