@@ -173,7 +173,7 @@ class Scene(Strict):
     def _grid(self, drawn: OccupancyMap | None) -> GridMap:
         if self.grid_map:
             try:
-                return read_map(Path(self.grid_map), cell_size=self.cell_size)
+                return replace(read_map(Path(self.grid_map), cell_size=self.cell_size), origin=self.origin)
             except (FleetError, OSError) as error:
                 raise ConfigError("scene", [Fault("grid_map", str(error))]) from error
         if drawn is None or not self._cells_from_map:
@@ -184,7 +184,8 @@ class Scene(Strict):
             _check_size(rows, columns)
         except ValueError as error:
             raise ConfigError("scene", [Fault("cell_size", f"{error}; choose larger cells")]) from error
-        return GridMap(rows, columns, self.cell_size, (drawn.origin.x, drawn.origin.y))
+        corner = drawn.origin
+        return GridMap(rows, columns, self.cell_size, (corner.x, corner.y), yaw=corner.yaw)
 
     def draw(self, resolution: float = 0.05, *, boxes: bool = False) -> OccupancyMap:
         """Return the map that a perfect mapper would make of the walls; doors are not on it.
@@ -197,7 +198,7 @@ class Scene(Strict):
         grid, walls = floor.grid, floor.walls
         if boxes:
             size = WorldSpec().box_size
-            specs = [BoxSpec(Pose(*grid.centre(cell), 0.0), size, size) for cell in self.box_cells]
+            specs = [BoxSpec(Pose(*grid.centre(cell), grid.yaw), size, size) for cell in self.box_cells]
             specs += [box.spec() for box in self.loose_boxes]
             walls += Walls(tuple(spec.block for spec in specs if spec.is_due(0.0)))
         inside = [grid.centre(cell) for cell in grid.free if not (boxes and cell in self.box_cells)]

@@ -70,9 +70,11 @@ def blocked_cell(
     """
     near = points[np.hypot(points[:, 0] - pose.x, points[:, 1] - pose.y) <= sight]
     reach = grid.cell_size / 2 - margin
+    c, s = cos(grid.yaw), sin(grid.yaw)
     for cell in cells_ahead(grid, pose, goal):
         x, y = grid.centre(cell)
-        inside = (np.abs(near[:, 0] - x) < reach) & (np.abs(near[:, 1] - y) < reach)
+        dx, dy = near[:, 0] - x, near[:, 1] - y
+        inside = (np.abs(c * dx + s * dy) < reach) & (np.abs(c * dy - s * dx) < reach)
         if np.count_nonzero(inside) >= _ENOUGH:
             return cell
     return None

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.geometry.poses import Pose, transform_points
 from rce_fleet.simulation.lidar import Floats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rce_fleet.geometry.poses import Pose
     from rce_fleet.planning.grid import GridMap
 
 THICKNESS = 0.1
@@ -69,6 +69,11 @@ class Block:
             ),
             glass,
         )
+
+    def placed(self, frame: Pose) -> Block:
+        """Return the block in the parent frame of the frame that its corners are given in."""
+        corners = transform_points(frame.as_array(), self.corners).tolist()
+        return replace(self, corners=tuple((x, y) for x, y in corners))
 
     @property
     def edges(self) -> list[tuple[float, float, float, float]]:
@@ -153,24 +158,22 @@ def polyline(points: Sequence[Point], *, closed: bool = False) -> Floats:
 
 def grid_walls(grid: GridMap, *, enclosed: bool = True) -> Walls:
     """Return the walls of a floor of cells: its blocked cells and, if ``enclosed``, a wall around it."""
-    (left, low), size = grid.origin, grid.cell_size
+    size, thick = grid.cell_size, THICKNESS
     blocks = [
-        Block.rectangle(
-            left + first * size, low + row * size, left + (last + 1) * size, low + (row + 1) * size
-        )
+        Block.rectangle(first * size, row * size, (last + 1) * size, (row + 1) * size)
         for row, first, last in _runs(grid)
     ]
-    if not enclosed:
-        return Walls(tuple(blocks))
-    right, high, thick = left + grid.columns * size, low + grid.rows * size, THICKNESS
-    around = (  # With the number of the edge that faces the floor.
-        (1, (left - thick, low - thick, left, high + thick)),
-        (3, (right, low - thick, right + thick, high + thick)),
-        (2, (left, low - thick, right, low)),
-        (0, (left, high, right, high + thick)),
-    )
-    blocks += [replace(Block.rectangle(*sides), face=face) for face, sides in around]
-    return Walls(tuple(blocks))
+    if enclosed:
+        right, high = grid.columns * size, grid.rows * size
+        around = (  # With the number of the edge that faces the floor.
+            (1, (-thick, -thick, 0.0, high + thick)),
+            (3, (right, -thick, right + thick, high + thick)),
+            (2, (0.0, -thick, right, 0.0)),
+            (0, (0.0, high, right, high + thick)),
+        )
+        blocks += [replace(Block.rectangle(*sides), face=face) for face, sides in around]
+    corner = Pose(*grid.origin, grid.yaw)
+    return Walls(tuple(block.placed(corner) for block in blocks))
 
 
 def _runs(grid: GridMap) -> Iterator[tuple[int, int, int]]:

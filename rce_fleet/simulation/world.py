@@ -271,7 +271,7 @@ class World:
         x, y = self.grid.centre(cell)
         size = self.spec.box_size
         try:
-            self.put_box(f"{_CELL}{cell}", BoxSpec(Pose(x, y, 0.0), size, size))
+            self.put_box(f"{_CELL}{cell}", BoxSpec(Pose(x, y, self.grid.yaw), size, size))
         except PlaceTakenError as error:
             raise OccupiedError(cell, error.things) from error
 

@@ -189,6 +189,14 @@ def test_a_box_ahead_is_found_and_a_robot_beside_the_cell_is_not() -> None:
     assert blocked_cell(grid, NOTHING, pose, goal, sight=1.2, margin=0.15) is None
 
 
+def test_a_corner_of_a_turned_cell_is_inside_of_it() -> None:
+    grid = GridMap(3, 3, yaw=0.6)
+    corner = np.array([grid.point(1.83, column) for column in (1.81, 1.82, 1.83)])
+    pose, goal = Pose(*grid.centre(3), grid.yaw), grid.centre(5)
+    assert blocked_cell(grid, corner, pose, goal, sight=2.0, margin=0.15) == 4
+    assert blocked_cell(grid, corner, pose, goal, sight=2.0, margin=0.2) is None
+
+
 def test_the_way_ahead_is_measured_from_the_hull() -> None:
     points = np.array([[2.0, 0.1], [1.0, 0.5], [-1.0, 0.0]])
     assert clear_ahead(points, Pose(0.0, 0.0, 0.0), 0.22) == pytest.approx(1.78)

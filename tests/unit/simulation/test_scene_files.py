@@ -15,6 +15,7 @@ from rce_fleet.drivers.robot_models import load_model, shipped_models
 from rce_fleet.drivers.scene import load_scene
 from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose
+from rce_fleet.maps.fleet_grid import fleet_grid
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
@@ -179,12 +180,33 @@ def test_a_ros_map_makes_a_world(tmp_path: Path) -> None:
     assert scene.draw().values_at([0.5, 4.5]) == 0
 
 
+def test_cells_of_a_turned_map_are_turned_too(tmp_path: Path) -> None:
+    """They are those that a fleet lays over the map: walls, boxes and robots in them are in the room."""
+    save_map(room(), tmp_path / "room")
+    text = "map: room.yaml\nenclosed: true\nwalls: [4]\nboxes: [16]\nrobots: [{id: R, cell: 10}]"
+    scene = load_scene(write(tmp_path, text))
+    world = scene.build()
+    grid = world.grid
+    assert grid.layout == fleet_grid(room()).layout
+    assert [world.is_solid(*grid.point(0.5, column), 0.01) for column in (3.9, 4.1, 4.9)] == [
+        False,
+        True,
+        True,
+    ]
+    assert [world.is_solid(*grid.point(2.5 + off, 4.5 + off), 0.01) for off in (0.28, 0.32)] == [True, False]
+    assert world.is_solid(*grid.point(-0.05, 3.0), 0.01)
+    drawn = scene.draw(boxes=True)
+    assert drawn.values_at([grid.centre(cell) for cell in (4, 10, 16)]).tolist() == [100, 0, 100]
+
+
 def test_a_movingai_map_makes_a_world(tmp_path: Path) -> None:
     (tmp_path / "m.map").write_text("type octile\nheight 3\nwidth 4\nmap\n....\n.@@.\n....\n")
     text = "grid_map: m.map\ncell_size: 2.0\nrobots: [{id: R, cell: 0}]"
     world = load_scene(write(tmp_path, text)).build()
     assert (world.grid.rows, world.grid.columns, sorted(world.grid.blocked)) == (3, 4, [5, 6])
     assert world.is_solid(3.0, 3.0, 0.1)
+    moved = load_scene(write(tmp_path, f"{text}\norigin: [-4, 1.5]")).build()
+    assert (moved.grid.origin, moved.robots["R"].pose) == ((-4.0, 1.5), Pose(-3.0, 2.5, 0.0))
     with pytest.raises(ConfigError, match=r"cells \[12\] are not on the map"):
         load_scene(write(tmp_path, f"{text}\nwalls: [12]")).build()
 
