@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,15 +44,17 @@ def make_grid(values: Mapping[str, Any]) -> GridMap:
     size = read_number(values, "cell_size", 1.0)
     if values.get("map_yaml"):
         return _grid_over(values, size)
+    origin = read_number(values, "origin_x", 0.0), read_number(values, "origin_y", 0.0)
+    yaw = read_number(values, "origin_yaw", 0.0)
     if values.get("map"):
-        return read_map(Path(str(values["map"])), cell_size=size)
+        return replace(read_map(Path(str(values["map"])), cell_size=size), origin=origin, yaw=yaw)
     return GridMap(
         rows=read_count(values, "rows", 8),
         columns=read_count(values, "columns", 8),
         cell_size=size,
-        origin=(read_number(values, "origin_x", 0.0), read_number(values, "origin_y", 0.0)),
+        origin=origin,
         blocked=frozenset(read_cells(values, "walls")),
-        yaw=read_number(values, "origin_yaw", 0.0),
+        yaw=yaw,
     )
 
 

@@ -102,6 +102,13 @@ def test_the_planner_reads_a_map_by_its_parameters(tmp_path: Path) -> None:
     assert make_grid({"rows": 2, "columns": 2, "origin_yaw": 0.2}).yaw == 0.2
 
 
+def test_a_movingai_map_lies_where_the_parameters_say(tmp_path: Path) -> None:
+    (tmp_path / "hall.map").write_text("type octile\nheight 1\nwidth 3\nmap\n..@\n")
+    place = {"origin_x": -4.0, "origin_y": 2, "origin_yaw": 0.2}
+    grid = make_grid({"map": str(tmp_path / "hall.map"), "cell_size": 0.5, **place})
+    assert grid == GridMap(1, 3, 0.5, (-4.0, 2.0), frozenset({2}), 0.2)
+
+
 def test_the_old_topic_is_for_robot_files_only() -> None:
     environment, planner = "/rce_environment", "/fleet_planner"
     assert wants_old_topic({}, {"/map": [environment]}, planner)
