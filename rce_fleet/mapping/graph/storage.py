@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,7 +98,7 @@ def load_graph(path: Path) -> KeyGraph:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
         raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise MapError(f"{path}: is damaged or not a graph map (.npz): {error}") from error
     _check(path, arrays)
     return _graph(arrays)
@@ -115,8 +116,9 @@ def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         )
     for name, shape in SHAPES.items():
         array = arrays.get(name)
-        if array is None or array.ndim != len(shape) or array.shape[1:] != shape[1:]:
-            what = "nothing" if array is None else f"shape {array.shape}"
+        has_shape = array is not None and array.ndim == len(shape) and array.shape[1:] == shape[1:]
+        if array is None or not has_shape or array.dtype.kind not in "iuf":
+            what = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
             raise MapError(f"{path}: expected '{name}' of shape {shape}, found {what}")
         if name != "ranges" and not np.isfinite(array).all():
             raise MapError(f"{path}: '{name}' has values that are not finite")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,6 +223,7 @@ def change(path: Path, target: Path, **changes: NDArray[Any]) -> None:
         ({"header": np.array('{"format": "rce graph map", "version": 99}')}, "version 99"),
         ({"header": np.array("nonsense")}, "has no header"),
         ({"poses": np.zeros((3, 2))}, r"expected 'poses' of shape \(None, 3\)"),
+        ({"poses": np.full((3, 3), "0")}, r"'poses' of shape \(None, 3\), found <U1 of shape \(3, 3\)"),
         ({"ways": np.zeros(2)}, "rows in 'ways', found 2"),
         ({"edge_ends": np.full((1, 2), 10**6)}, "rows in 'edge_poses'|does not have"),
     ],
@@ -241,3 +243,19 @@ def test_damaged_map_file_is_refused(saved: tuple[KeyGraph, Path, Poses], tmp_pa
         load_graph(path)
     with pytest.raises(MapError, match="cannot be read"):
         load_graph(tmp_path / "missing.npz")
+
+
+def test_map_file_with_wrong_bytes_is_refused(saved: tuple[KeyGraph, Path, Poses], tmp_path: Path) -> None:
+    path, content = tmp_path / "wrong.npz", saved[1].read_bytes()
+    draw, reasons = Random(5), set[str]()
+    for _ in range(60):
+        damaged = bytearray(content)
+        place = draw.randrange(len(content) - 4)
+        damaged[place : place + 4] = draw.choice((bytes(4), b"\xff" * 4, draw.randbytes(4)))
+        path.write_bytes(damaged)
+        try:
+            load_graph(path)
+        except MapError as error:
+            reasons.add(str(error))
+    assert len(reasons) > 1
+    assert all(reason.startswith(f"{path}: ") for reason in reasons)
