@@ -368,8 +368,8 @@ class Manager:
 
     def _start_waiting(self) -> None:
         """Start waiting containers within the limit, and drop those not desired any more."""
-        for id_ in self._queue.discard(self._is_unwanted):
-            self._feed(events.Lost(id_, "", "it is not wanted any more"))
+        for unwanted in self._queue.discard(self._is_unwanted):
+            self._feed(events.Lost(unwanted, "", "it is not wanted any more"))
         most = self._settings.starts_at_once
         while len(self._starting) < most and (id_ := self._queue.take(one.id for one in self._starting)):
             self._start(id_)

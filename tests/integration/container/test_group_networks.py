@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 import pytest
-from support.containers import Machine, until
+from support.containers import Machine, is_in, until
 
 from rce.control.messages import Fault
 from rce.control.model import EndpointState, NodeState
@@ -186,7 +186,7 @@ async def test_an_address_is_given_out_once_and_again(machine: Machine) -> None:
         fault = await until(lambda: machine.of(Fault), what="a fault")
         assert fault[0].id == "user/b"
         assert "the groupIp 10.0.0.1 belongs to container a of the same group; take another" in fault[0].text
-        assert machine.reported("user/b").state is EndpointState.FAILED
+        await until(lambda: is_in(machine, "user/b", EndpointState.FAILED), what="b has failed")
         await machine.drop("user/a")
         await until(lambda: machine.node("user/b", "node"), what="b")
         await machine.log_holds("user/b", "node", "serving")

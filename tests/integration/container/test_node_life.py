@@ -337,6 +337,7 @@ async def test_the_logs_of_what_could_not_be_made_say_so(
         with monkeypatch.context() as patch:
             patch.setattr(type(machine.runtime), "start", refuse)
             await machine.put(BOX)
-            assert "the disk is full" in machine.faults[0]
+            faults = await until(lambda: machine.faults, what="a fault")
+            assert "the disk is full" in faults[0]
             for record in (machine.folder / "state" / "logs" / BOX).glob("*.json"):
                 assert "cannot be started: the disk is full" in record.read_text()

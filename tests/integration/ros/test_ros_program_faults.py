@@ -95,9 +95,12 @@ async def test_handler_awaiting_a_cancelled_task_answers_with_an_error(make_node
 @pytest.mark.parametrize("is_async", [True, False])
 @pytest.mark.parametrize("kind", [ServiceFaultError, ValueError])
 async def test_error_text_that_utf8_cannot_hold_is_escaped(
-    make_node: MakeNode, is_async: bool, kind: type[Exception]
+    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch, is_async: bool, kind: type[Exception]
 ) -> None:
     """As the name of a file that was made elsewhere; the node continues."""
+    # What pytest keeps of a log cannot be sent to its main process.
+    monkeypatch.setattr(logging.getLogger("rce.ros.node.service"), "disabled", True)
+
     text = "no map caf\udce9"
     error = ServiceFaultError("/go", text) if kind is ServiceFaultError else kind(text)
 

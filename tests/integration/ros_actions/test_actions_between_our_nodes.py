@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, TypedDict, Unpack
@@ -190,7 +191,13 @@ async def test_a_handler_that_fails_aborts_its_goal(
             await client.send(order="many")
 
 
-async def test_error_text_that_utf8_cannot_hold_ends_only_its_goal(make_node: MakeNode) -> None:
+async def test_error_text_that_utf8_cannot_hold_ends_only_its_goal(
+    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        logging.getLogger("rce.ros.actions.server"), "disabled", True
+    )  # pytest cannot send it
+
     async def fail(goal: ServerGoal) -> dict[str, Any]:
         if goal.request.order:
             raise ValueError("no map caf\udce9")

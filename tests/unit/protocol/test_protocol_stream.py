@@ -263,7 +263,7 @@ MANY_IDS = [f"{number:032x}" for number in range(4000)]
 )
 def test_memory_of_incomplete_messages_is_counted(msg: object, come: int) -> None:
     """They are kept parsed, which takes many times the memory of the text."""
-    frames = [starred(msg), *(binary(id_, b"x") for id_ in MANY_IDS[:come])]
+    frames: list[str | bytes] = [starred(msg), *(binary(id_, b"x") for id_ in MANY_IDS[:come])]
     for frame in frames:
         ProtocolStream.for_engine().feed(frame, 0.0)  # what is loaded and cached is there now
     stream = ProtocolStream.for_engine()
