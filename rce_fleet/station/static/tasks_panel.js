@@ -9,6 +9,24 @@ const TONE = { running: "good", queued: "quiet", assigned: "quiet", held: "warn"
 
 const MOST_OPEN = 100;
 
+// Show rows in a table. One that looks as before stays where it is: a button that is replaced between press and
+// release would lose the click.
+function showRows(body, rows) {
+  const before = new Map([...body.children].map((row) => [row.dataset.key, row]));
+  const shown = rows.map((row) => {
+    const known = before.get(row.dataset.key);
+    before.delete(row.dataset.key);
+    return known?.isEqualNode(row) ? known : row;
+  });
+  const kept = new Set(shown);
+  for (const row of [...body.children]) if (!kept.has(row)) row.remove();
+  let next = body.firstElementChild;
+  for (const row of shown) {
+    if (row === next) next = next.nextElementSibling;
+    else body.insertBefore(row, next);
+  }
+}
+
 // Whether the action that is under way ends only when a person or a program confirms it.
 function awaitsConfirmation({ visits, stops }) {
   const last = visits.at(-1);
@@ -36,13 +54,14 @@ export class TasksPanel {
     const focused = document.activeElement?.id;
     const rows = tasks.flatMap((task) => [this.#row(task), this.#buttons(task)]);
     if (more > 0) rows.splice(2 * open.length, 0, this.#more(more));
-    this.body.replaceChildren(...rows);
+    showRows(this.body, rows);
     if (focused?.startsWith("task-")) document.getElementById(focused)?.focus();
   }
 
   // Open tasks that are not listed.
   #more(count) {
     const row = element("tr");
+    row.dataset.key = "more";
     const cell = element("td", t("tasks.more", { count }), "quiet");
     cell.colSpan = 5;
     row.append(cell);
@@ -52,6 +71,7 @@ export class TasksPanel {
   #row(task) {
     const row = element("tr");
     row.dataset.task = task.id;
+    row.dataset.key = task.id;
     row.title = task.reason;
     const stops = task.stops.map(({ action, cell, cells }) => `${t(`stop.${action}`)} ${cell ?? cells?.join("/") ?? ""}`.trim()).join(", ");
     const state = element("td", t(`task.${task.state}`), TONE[task.state]);
@@ -72,6 +92,7 @@ export class TasksPanel {
   // A row below the task's.
   #buttons(task) {
     const row = element("tr");
+    row.dataset.key = `answers ${task.id}`;
     const cell = element("td", "", "answers");
     cell.colSpan = 5;
     row.append(cell);
@@ -88,7 +109,7 @@ export class TasksPanel {
     if (awaitsConfirmation(task)) add("confirm", () => this.actions.confirmTask(task.id));
     if (task.state === "held") add("resume", () => this.actions.resumeTask(task.id));
     else if (!recurs) add("hold", () => this.actions.holdTask(task.id));
-    add("raise", () => this.actions.raise(task.id, Math.min(100, (task.priority ?? 0) + 10)));
+    add("raise", () => this.actions.raise(task.id, Math.min(100, ((this.work.tasks.get(task.id) ?? task).priority ?? 0) + 10)));
     add("cancel", () => this.actions.cancelTask(task.id));
     return row;
   }

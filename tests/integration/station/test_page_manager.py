@@ -68,13 +68,23 @@ async def check_task(page: Page) -> None:
     assert "done" in row
 
 
+async def press(page: Page, selector: str) -> None:
+    """Click; the list is drawn again between press and release, as when a task changes then."""
+    button = page.locator(selector)
+    await button.scroll_into_view_if_needed()
+    await button.hover()
+    await page.mouse.down()
+    await page.evaluate("void rceFleet.work.dispatchEvent(new Event('change'))")
+    await page.mouse.up()
+
+
 async def check_buttons(page: Page, fleet: ManagedFleet) -> None:
     """A task is held, resumed, given to another robot and cancelled by its buttons."""
     created = await fleet.ask("POST", "/tasks", {"stops": [{"cell": 27, "confirm": True}]})
     task = created.body["id"]
     await page.locator(f"#task-{task}-hold").click()
     await fleet.until_state(task, "held")
-    await page.locator(f"#task-{task}-resume").click()
+    await press(page, f"#task-{task}-resume")
     running = await fleet.until_state(task, "running")
     robot = running["robot_assigned"]
     await fleet.ask("POST", f"/robots/{robot}/pause")
