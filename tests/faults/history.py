@@ -56,6 +56,8 @@ class History:
         lost_links: What robots saw of links that were interrupted.
         cuts: Masters that were cut off, with start and end. TCP sends again what was on its way then, and
             it arrives when the network is back; task sets refuse it by its term.
+        stops: Masters that were stopped, and when they went on. One that is stopped between its look at the
+            lease and the write sends that one message when it goes on; task sets refuse it by its term.
     """
 
     made: dict[str, Fate] = field(default_factory=dict)
@@ -65,6 +67,7 @@ class History:
     acknowledged: list[tuple[float, float]] = field(default_factory=list)
     lost_links: list[str] = field(default_factory=list)
     cuts: list[tuple[str, float, float]] = field(default_factory=list)
+    stops: list[tuple[str, float]] = field(default_factory=list)
 
     def wrote(self, register: str, start: float, end: float, value: int, fate: Fate) -> None:
         """Note a write."""
@@ -159,7 +162,19 @@ class History:
             begun.setdefault(each.term, each.at)
             if leaders.setdefault(each.term, each.master) != each.master:
                 yield f"{leaders[each.term]} and {each.master} both led in term {each.term}"
+        begun_to_send = list(self.stops)
         for each in self.heard:
             newer = min((at for term, at in begun.items() if term > each.term), default=math.inf)
-            if each.at > newer + DELIVERY_S and not self._is_late(each):
+            if each.at <= newer + DELIVERY_S or self._is_late(each):
+                continue
+            stop = next((stop for stop in begun_to_send if _ended(stop, each)), None)
+            if stop is not None:
+                begun_to_send.remove(stop)
+            else:
                 yield f"{each} came {each.at - newer:.1f} s after a newer term had begun"
+
+
+def _ended(stop: tuple[str, float], heard: Heard) -> bool:
+    """Return whether a message came from a master that had just gone on."""
+    master, end = stop
+    return heard.master == master and end <= heard.at <= end + DELIVERY_S

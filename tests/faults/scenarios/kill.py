@@ -92,6 +92,7 @@ async def _stopped(world: World) -> AsyncIterator[tuple[Machine, float]]:
         await world.cluster.leader(but=leader)
         await asyncio.sleep(max(0.0, since + seconds - time.monotonic()))
     finally:
+        world.history.stops.append((leader.name, time.monotonic()))
         send(leader.master, signal.SIGCONT)
 
     def noticed() -> bool:

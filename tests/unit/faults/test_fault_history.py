@@ -142,6 +142,17 @@ def test_what_a_cut_held_up_is_no_act_of_an_older_term() -> None:
     assert History(heard=heard, cuts=[("m1", 2, 5)]).violations([], 0) != []
 
 
+def test_a_stopped_master_may_have_begun_to_send_one_message() -> None:
+    heard = [Heard(1, "m1", 1, "Sync"), Heard(5, "m2", 2, "Sync"), Heard(12, "m1", 1, "Welcome")]
+    assert History(heard=heard, stops=[("m1", 11.9)]).violations([], 0) == []
+    assert History(heard=heard, stops=[("m2", 11.9)]).violations([], 0) != []
+    assert History(heard=heard, stops=[("m1", 11)]).violations([], 0) != []
+    assert History(heard=heard, stops=[("m1", 12.1)]).violations([], 0) != []
+    second = [*heard, Heard(12.1, "m1", 1, "Sync")]
+    assert len(History(heard=second, stops=[("m1", 11.9)]).violations([], 0)) == 1
+    assert History(heard=second, stops=[("m1", 11.9), ("m1", 11.8)]).violations([], 0) == []
+
+
 def test_two_leaders_of_one_term_are_told() -> None:
     history = History(heard=[Heard(1, "m1", 4, "Sync"), Heard(2, "m2", 4, "Sync")])
     assert history.violations([], 0) == ["m1 and m2 both led in term 4"]
