@@ -247,14 +247,15 @@ def temper(weights: NDArray[np.float64], logs: NDArray[np.float64], least: float
     """Return weights multiplied by likelihoods, or by a root of them if few particles would keep any weight.
 
     Args:
-        weights: shape (N,), normalized.
+        weights: shape (N,), normalized; some may be 0.
         logs: shape (N,): logarithms of the likelihoods.
         least: Share of the effective number of particles that must remain.
 
     Returns:
         shape (N,), normalized.
     """
-    logs = logs - logs.max()
+    # Those without weight count for nothing, however likely they are: all others could become 0 beside them.
+    logs = np.minimum(logs - logs[weights > 0].max(), 0.0)
     wanted = min(least * len(weights), effective_count(weights))
     made = _times(weights, logs)
     if effective_count(made) >= wanted:

@@ -90,14 +90,14 @@ def read_trajectory(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             header, *rows = list(csv.reader(stream)) or [[]]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{path}: cannot be read: {error}") from error
     if tuple(header) != HEADER:
         raise LogError(f"{path}:1: expected the header {','.join(HEADER)}, found {','.join(header)[:80]!r}")
     values = np.empty((len(rows), len(HEADER)))
     for number, row in enumerate(rows):
         try:
-            values[number] = [float(text) for text in row]
+            values[number] = np.array([float(text) for text in row]).reshape(len(HEADER))
         except ValueError as error:
             raise LogError(f"{path}:{number + 2}: expected {len(HEADER)} numbers: {error}") from error
     return values[:, 1], values[:, 2:]

@@ -43,6 +43,8 @@ class GoalList:
         self._goals: dict[str, Goal] = {}
         self._ended: list[Goal] = []
         self._recalled_until = float("-inf")
+        self._unnamed = 0
+        """Goals that came without an id."""
 
     @property
     def goals(self) -> list[Goal]:
@@ -62,8 +64,11 @@ class GoalList:
     def accept(self, goal_id: str, stamp: float, x: float, y: float) -> bool:
         """Accept a goal; return whether the robot has to drive to it. A known one changes nothing.
 
-        One whose place is not finite is rejected, and the goal before it stays.
+        One whose place is not finite is rejected, and the goal before it stays. One without an id gets one.
         """
+        if not goal_id:
+            self._unnamed += 1
+            goal_id = f"goal-{self._unnamed}"
         if goal_id in self._goals:
             return False
         goal = self._goals[goal_id] = Goal(goal_id, stamp, (x, y))
@@ -71,7 +76,7 @@ class GoalList:
             goal.fault = f"target_pose.pose.position is x={x}, y={y}; send finite numbers, in metres"
             self._end(goal, GoalState.REJECTED)
             return False
-        if stamp <= self._recalled_until:
+        if stamp and stamp <= self._recalled_until:
             self._end(goal, GoalState.RECALLED)
             return False
         if self.current is not None:
@@ -90,7 +95,8 @@ class GoalList:
         goal = self.current
         if goal is None or goal.state is not GoalState.ACTIVE:
             return False
-        if goal.id == goal_id or goal.stamp <= stamp or (not goal_id and not stamp):
+        is_earlier = stamp != 0 and goal.stamp <= stamp
+        if goal.id == goal_id or is_earlier or (not goal_id and not stamp):
             goal.state = GoalState.PREEMPTING
             self.ending = GoalState.PREEMPTED
             return True

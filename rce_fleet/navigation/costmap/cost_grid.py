@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import floor
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -59,6 +60,8 @@ class Area(NamedTuple):
 
 
 NOWHERE = Area(0, 0, 0, 0)
+FARTHEST = 2.0**31
+"""The farthest row and column of a point."""
 
 
 class CostGrid:
@@ -109,11 +112,12 @@ class CostGrid:
         return Area(0, 0, *self.shape)
 
     def cell_of(self, x: float, y: float) -> tuple[int, int]:
-        """Return row and column of a point in metres; they may lie outside the grid."""
-        return (
-            int(np.floor((y - self.origin[1]) / self.resolution)),
-            int(np.floor((x - self.origin[0]) / self.resolution)),
-        )
+        """Return row and column of a point in metres; they may lie outside the grid.
+
+        Points farther away than ``FARTHEST`` cells are in the farthest ones.
+        """
+        row, column = (y - self.origin[1]) / self.resolution, (x - self.origin[0]) / self.resolution
+        return floor(min(max(row, -FARTHEST), FARTHEST)), floor(min(max(column, -FARTHEST), FARTHEST))
 
     def cells_of(self, points: Floats) -> Cells:
         """Return rows and columns of points, shape (N, 2); they may lie outside the grid.

@@ -43,11 +43,19 @@ def line_cells(start: Floats, end: Floats) -> tuple[Ints, Ints, Floats]:
 
 
 def line_cost(steps: Steps, start: Floats, end: Floats) -> float:
-    """Return the cost of a straight line; ``inf`` if it crosses a cell that cannot be entered."""
+    """Return the cost of a straight line; ``inf`` if it crosses a cell that cannot be entered.
+
+    Through a corner of four cells it leads only where all of them can be entered, as a diagonal step.
+    """
     rows, columns, lengths = line_cells(start, end)
     prices = steps[rows, columns]
     crossed = lengths > 1e-9  # noqa: PLR2004 - a line through a corner touches cells without crossing them
     if not prices[crossed].all():
+        return np.inf
+    rows, columns = rows[crossed], columns[crossed]
+    corners = np.flatnonzero((np.diff(rows) != 0) & (np.diff(columns) != 0))
+    beside = steps[rows[corners], columns[corners + 1]], steps[rows[corners + 1], columns[corners]]
+    if not all(each.all() for each in beside):
         return np.inf
     return float(prices @ lengths)
 

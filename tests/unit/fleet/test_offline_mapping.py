@@ -24,7 +24,7 @@ from rce_fleet.geometry.poses import compose
 from rce_fleet.mapping.gmapping.mapper import ParticleMapper
 from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.mapper import Mapper
-from rce_fleet.mapping.trajectory import read_trajectory
+from rce_fleet.mapping.trajectory import read_trajectory, write_trajectory
 from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.offline import commands, outputs
 from rce_fleet.offline.inputs import read_log
@@ -69,6 +69,16 @@ def test_a_log_becomes_a_map_and_a_trajectory(tmp_path: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     assert sorted(report) == ["log_seconds", "loop_closures", "scans", "seconds"]
     assert (report["scans"], report["log_seconds"]) == (60, 59)
+
+
+@pytest.mark.parametrize("row", ["5", "1,2,3", "1,2,3,4,x", "", "1,2,3,4,5,6"])
+def test_a_faulty_row_of_a_trajectory_is_told_with_its_line(tmp_path: Path, row: str) -> None:
+    path = tmp_path / "trajectory.csv"
+    write_trajectory(path, [0.0], np.zeros((1, 3)))
+    with path.open("a") as stream:
+        stream.write(f"{row}\r\n")
+    with pytest.raises(LogError, match=f"{path}:3: expected 5 numbers"):
+        read_trajectory(path)
 
 
 def test_a_bag_becomes_a_map(tmp_path: Path) -> None:

@@ -276,6 +276,13 @@ def test_tempered_weights_keep_enough_particles() -> None:
     assert flat == pytest.approx(np.exp(-1e-3 * np.arange(1000)) / np.exp(-1e-3 * np.arange(1000)).sum())
 
 
+def test_particles_without_weight_stay_without_it() -> None:
+    weights = np.array([0.0, 0.5, 0.5, 0.0])
+    for logs in ([0.0, -1000.0, -1001.0, -1.0], [2000.0, -3.0, -4.0, np.inf]):
+        made = temper(weights, np.array(logs), 0.0)
+        assert made == pytest.approx([0.0, 1 / (1 + np.exp(-1)), np.exp(-1) / (1 + np.exp(-1)), 0.0])
+
+
 # Clusters
 
 

@@ -15,7 +15,7 @@ from rce_fleet.navigation.costmap.costs import FREE, INSCRIBED, LETHAL, UNKNOWN
 from rce_fleet.navigation.planners import global_planner
 from rce_fleet.navigation.planners.cost_to_go import UNREACHED, spread, steps_of
 from rce_fleet.navigation.planners.global_planner import GlobalPlannerParameters, make_plan
-from rce_fleet.navigation.planners.shortcuts import line_cells
+from rce_fleet.navigation.planners.shortcuts import line_cells, line_cost
 
 ROWS, COLUMNS = 24, 30
 
@@ -233,6 +233,36 @@ def test_a_line_is_split_into_the_cells_it_crosses(
     crossed = set(zip(rows.tolist(), columns.tolist(), strict=True))
     off_edges = np.abs(at - np.round(at)).min(axis=1) > 1e-6
     assert {(int(r), int(c)) for r, c in np.floor(at[off_edges])} <= crossed
+
+
+def test_no_line_leads_through_a_corner_of_two_walls() -> None:
+    steps = np.full((8, 8), 50, np.int16)
+    start, end = np.array((2.5, 2.5)), np.array((4.5, 4.5))
+    assert line_cost(steps, start, end) == pytest.approx(50 * np.hypot(2, 2))
+    for wall in ((3, 4), (4, 3)):
+        steps[wall] = 0
+        assert line_cost(steps, start, end) == inf
+        assert line_cost(steps, end, start) == inf
+        steps[wall] = 50
+
+
+def test_straight_parts_of_a_way_pass_no_corner_of_walls() -> None:
+    """The straight line from start to goal leads through a wall's corner."""
+    costs = empty()
+    costs[12:, 15] = LETHAL
+    costs[11, :15] = LETHAL
+    costs[11, 14] = FREE
+    start, goal = Pose(1.45, 1.25, 0.0), Pose(1.55, 1.15, 0.0)
+    plan = make_plan(grid_of(costs), start, goal)
+    assert plan.found
+    assert len(plan.path) > 2
+
+
+def test_a_goal_beyond_all_numbers_has_a_reason() -> None:
+    far = Pose(1e308, -1e308, 0.0)
+    grid = grid_of(empty())
+    for start, goal in ((Pose(1.0, 1.0, 0.0), far), (far, Pose(1.0, 1.0, 0.0))):
+        assert "is off the costmap" in make_plan(grid, start, goal).reason
 
 
 def test_a_tolerance_may_be_infinite_but_not_nan() -> None:
