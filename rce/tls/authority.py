@@ -72,6 +72,9 @@ def make_authority(days: float = AUTHORITY_DAYS) -> Issued:
 
     Args:
         days: How long it is valid.
+
+    Raises:
+        CertificateError: So many days end after the year 9999.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"RCE engine authority {secrets.token_hex(4)}")
@@ -94,8 +97,8 @@ def issue(authority: Issued, name: str, hosts: Iterable[str], days: float = CERT
         days: How long it is valid; it ends with the authority at the latest.
 
     Raises:
-        CertificateError: The authority cannot be read or has expired, or a host is neither a name nor an
-            address.
+        CertificateError: The authority cannot be read or has expired, so many days end after the year 9999,
+            or a host is neither a name nor an address.
     """
     try:
         signer = x509.load_pem_x509_certificate(authority.certificate)
@@ -176,7 +179,12 @@ def _builder(
     latest: datetime | None = None,
 ) -> x509.CertificateBuilder:
     now = datetime.now(UTC)
-    end = now + timedelta(days=days)
+    try:
+        end = now + timedelta(days=days)
+    except OverflowError as error:
+        raise CertificateError(
+            f"a certificate cannot be valid for {days:g} days: that ends after the year 9999; take fewer days"
+        ) from error
     return (
         x509.CertificateBuilder()
         .subject_name(subject)

@@ -8,6 +8,7 @@ issues nothing has no ``authority.key``.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 import stat
@@ -77,13 +78,23 @@ class CertificateFolder:
         Raises:
             CertificateError: There is one already, or the folder cannot be written.
         """
-        if self.authority.exists() or self.key(AUTHORITY).exists():
-            raise CertificateError(
-                f"there is an authority in {self.path} already; all certificates that it issued depend on it"
-            )
-        self._write(AUTHORITY, make_authority(days))
-        for file in (self.revoked, self.path / _RECORDS):  # of a former authority
-            file.unlink(missing_ok=True)
+        made = make_authority(days)
+        with self._locked():
+            if self.authority.exists() or (self.key(AUTHORITY).exists() and self._has_issued()):
+                raise CertificateError(
+                    f"there is an authority in {self.path} already; all certificates that it issued depend on"
+                    " it"
+                )
+            self._write(AUTHORITY, made)
+            for file in (self.revoked, self.path / _RECORDS):  # of a former authority
+                file.unlink(missing_ok=True)
+
+    def _has_issued(self) -> bool:
+        """Whether a certificate depends on the key: none does if only the authority's certificate is missing.
+
+        A program that was killed between both files of the authority left the key alone.
+        """
+        return (self.path / _RECORDS).exists() or any(self.path.glob("*.pem"))
 
     def issue(self, name: str, hosts: Iterable[str] = (), days: float = CERTIFICATE_DAYS) -> Details:
         """Issue a certificate, or renew it: programs that run load the new one by themselves.
@@ -113,8 +124,9 @@ class CertificateFolder:
         if not hosts:
             hosts = (name,)
         issued = issue(self._authority(), name, hosts, days)
-        self._record(name, read_details(issued.certificate))
-        self._write(name, issued)
+        with self._locked():
+            self._record(name, read_details(issued.certificate))
+            self._write(name, issued)
         return self.details(name)
 
     def revoke(self, name: str) -> list[Revocation]:
@@ -139,11 +151,12 @@ class CertificateFolder:
             raise CertificateError(
                 f"no certificate {name!r} was issued in {self.path}; see: rce certificate list"
             )
-        known = self.revocations()
-        now = datetime.now(UTC)
-        added = [Revocation(serial, now) for serial in sorted(serials - {one.serial for one in known})]
-        if added:
-            self._write_list([*known, *added])
+        with self._locked():
+            known = self.revocations()
+            now = datetime.now(UTC)
+            added = [Revocation(serial, now) for serial in sorted(serials - {one.serial for one in known})]
+            if added:
+                self._write_list([*known, *added])
         return added
 
     def ensure_list(self) -> None:
@@ -153,8 +166,9 @@ class CertificateFolder:
             CertificateError: No authority is here, or the file cannot be written.
         """
         self._need_authority()
-        if not self.revoked.exists():
-            self._write_list([])
+        with self._locked():
+            if not self.revoked.exists():
+                self._write_list([])
 
     def _write_list(self, revoked: list[Revocation]) -> None:
         text = make_list(self._authority(), revoked)
@@ -264,6 +278,17 @@ class CertificateFolder:
             # A program that reads between the two writes finds a wrong pair, and keeps the old one.
             _write_private(self.key(name), issued.key)
             _write_private(self.certificate(name), issued.certificate)
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Wait for other programs that issue or revoke here: what one has recorded must not be lost."""
+        with self._writing():
+            folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX)
+                yield
+            finally:
+                os.close(folder)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

@@ -64,9 +64,15 @@ class TlsGate:
     def take(self, transport: asyncio.BaseTransport, protocol: asyncio.Protocol) -> None:
         """Take the socket of an accepted connection over, and shake hands on it."""
         accepted = transport.get_extra_info("socket")
-        sock = None if self._handshakes.closed else socket.socket(fileno=os.dup(accepted.fileno()))
         address = address_of(transport.get_extra_info("peername"))
-        cast("asyncio.Transport", transport).abort()  # uvloop's only behave like one
+        sock = None
+        try:
+            if not self._handshakes.closed:
+                sock = socket.socket(fileno=os.dup(accepted.fileno()))
+        except OSError as error:  # no descriptor is left
+            self._complain(address, explain_to_server(error))
+        finally:
+            cast("asyncio.Transport", transport).abort()  # uvloop's only behave like one
         if sock is not None:
             self._handshakes.spawn(self._run(sock, protocol, address), name=f"TLS handshake with {address}")
 

@@ -76,7 +76,7 @@ async def _keep(settings: EngineSettings, say: Callable[[str], None]) -> None:
         await asyncio.sleep(CHECK_EVERY_S)
         try:
             done = await asyncio.to_thread(ensure, settings, await LOOKUPS.own_name())
-        except CertificateError as error:
+        except (CertificateError, OSError) as error:
             done = f"cannot renew certificates: {error}"
         if done:
             say(done)

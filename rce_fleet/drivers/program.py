@@ -174,10 +174,11 @@ class Simulation:
         self._scene.place(start, self._world)
         try:
             return await self._start_graph(start.id)
-        except (PortTakenError, MasterError) as error:
-            self._graphs.pop(start.id, None)
-            self._world.remove_robot(start.id)
-            raise FleetError(f"{start.id} was not put in: {error}") from error
+        except BaseException as error:
+            await self.remove_robot(start.id)
+            if isinstance(error, (PortTakenError, MasterError)):
+                raise FleetError(f"{start.id} was not put in: {error}") from error
+            raise
 
     async def remove_robot(self, robot: str) -> None:
         """Stop a robot's node, and take the robot out of the world."""
@@ -193,7 +194,8 @@ class Simulation:
         assert self._tasks is not None, "robots start while the simulation runs"
         graph = self._graphs[robot] = _RobotGraph(robot)
         graph.task = self._tasks.create_task(graph.keep(self._enter_graph), name=f"robot {robot}")
-        return await graph.started
+        # A request that is cancelled must not cancel the start, which the graph's task completes.
+        return await asyncio.shield(graph.started)
 
     async def _stop_graphs(self) -> None:
         for graph in list(self._graphs.values()):
@@ -209,12 +211,9 @@ class Simulation:
         else:
             prefix = robot if self._cores.namespaces else ""
             name, namespace = ROBOT_NODE, prefix
-        node = await stack.enter_async_context(self._node(name, uri, namespace))
+        node = await self._join(stack, name, uri, namespace)
         if prefix:
             await node.set_param(frames.PARAMETER, prefix)
-        if self._options.clock:
-            await node.set_param(USE_SIM_TIME, value=True)
-        await self._runner.publish_clock(node)
         stack.callback(self._runner.drop_clock, uri)
         stand_ins = self._scene.stand_ins if self._options.stand_ins is None else self._options.stand_ins
         driver = RobotDriver(
@@ -236,8 +235,7 @@ class Simulation:
             rows = range(first, min(first + share, len(light)))
             names = f"{light.names[rows[0]]} to {light.names[rows[-1]]}"
             uri = self._cores.default or await self._start_core(stack, self._next_port(), f"robots {names}")
-            node = await stack.enter_async_context(self._node(f"light_robots_{first + 1}", uri))
-            await self._runner.publish_clock(node)
+            node = await self._join(stack, f"light_robots_{first + 1}", uri)
             driver = LightDriver(node, light, rows, self._runner.stamp)
             await driver.start()
             drivers.append(driver)
@@ -271,20 +269,23 @@ class Simulation:
         except OSError as error:
             text = f"the core of {whose} cannot listen on port {port}: {error.strerror or error}"
             raise PortTakenError(f"{text}; end the program that does, or choose other ports") from error
-        if self._options.clock:
-            core.set_param(USE_SIM_TIME, value=True)
         return core.uri
 
-    def _node(self, name: str, uri: str, namespace: str = "") -> Node:
-        return Node(name, namespace=namespace, argv=(), master_uri=uri, types=self._types, signals=False)
+    async def _join(self, stack: AsyncExitStack, name: str, uri: str, namespace: str = "") -> Node:
+        """Return a node of a graph, which the stack ends; the graph has the world's clock then."""
+        node = Node(name, namespace=namespace, argv=(), master_uri=uri, types=self._types, signals=False)
+        await stack.enter_async_context(node)
+        if self._options.clock:
+            await node.set_param(USE_SIM_TIME, value=True)
+        await self._runner.publish_clock(node)
+        return node
 
     async def _start_services(self, stack: AsyncExitStack) -> None:
         port = self._options.world_port
         if port is None:
             return
         uri = self._cores.default or await self._start_core(stack, port, "the world")
-        node = await stack.enter_async_context(self._node(WORLD_NODE, uri))
-        await self._runner.publish_clock(node)
+        node = await self._join(stack, WORLD_NODE, uri)
         await WorldServices(node, self._runner, self).start()
         self._say(f"world ROS_MASTER_URI={uri}")
 

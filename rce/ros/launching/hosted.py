@@ -79,6 +79,9 @@ class HostedNode(LaunchedNode):
         try:
             result = await getattr(importlib.import_module(self._command.module), MAIN)()
         except SystemExit as error:  # as of argparse
+            if isinstance(error.code, str):
+                self._report(f"{self.plan.name}: {error.code}")
+                return FAILED
             result = error.code
         except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the others run on
             pass_cancellation(error)

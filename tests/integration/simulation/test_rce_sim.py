@@ -16,10 +16,11 @@ import pytest
 from support.engine import Program, until
 from support.ports import free_port
 
+from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.tf import TransformListener
 from rce.ros.types import Message, TypeRegistry
-from rce_fleet.drivers.program import Simulation
+from rce_fleet.drivers.program import Cores, RunOptions, Simulation
 from rce_fleet.drivers.scene import RobotStart, Scene
 from rce_fleet.exceptions import FleetError
 
@@ -263,6 +264,38 @@ async def test_a_robot_whose_port_is_taken_is_not_left_in_the_world(
         await simulation.add_robot(start)
         await asyncio.gather(simulation.remove_robot("R"), simulation.remove_robot("R"))
         assert dict(simulation.world.robots) == {}
+        stop.set()
+
+
+async def test_a_robot_whose_request_is_cancelled_is_not_left_in_the_world() -> None:
+    said: list[str] = []
+    simulation = Simulation(Scene(), TypeRegistry(), said.append)
+    start, stop = RobotStart(id="R", at=(3.0, 3.0)), asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(simulation.run(stop))
+        await until(lambda: "simulation ready: 0 robots, 0 boxes" in said, timeout=60, what="the world runs")
+        request = asyncio.create_task(simulation.add_robot(start))
+        while "R" not in simulation.world.robots:  # its node starts then
+            await asyncio.sleep(0)
+        request.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await request
+        assert dict(simulation.world.robots) == {}
+        await simulation.add_robot(start)
+        stop.set()
+
+
+async def test_light_robots_bring_the_clock_to_a_core_that_runs() -> None:
+    scene = Scene.model_validate({"light_robots": [{"id": "Robot1", "cell": 9}]})
+    stop, said = asyncio.Event(), list[str]()
+    async with Core(port=0) as core, asyncio.TaskGroup() as tasks:
+        options = RunOptions(clock=True)
+        simulation = Simulation(scene, TypeRegistry(), said.append, cores=Cores(core.uri), options=options)
+        tasks.create_task(simulation.run(stop))
+        await until(lambda: "simulation ready: 1 robots, 0 boxes" in said, timeout=60, what="it runs")
+        async with Node("t", argv=(), master_uri=core.uri, signals=False) as node:
+            assert await node.get_param("/use_sim_time") is True
+            await until(lambda: node.now().to_sec() > 0, timeout=60, what="the world's clock is heard")
         stop.set()
 
 

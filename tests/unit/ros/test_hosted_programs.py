@@ -45,6 +45,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "    if word == 'wait': await asyncio.Event().wait()\n"
         "    if word == 'fail': raise ValueError(word)\n"
         "    if word == 'exit': raise SystemExit(3)\n"
+        "    if word == 'say': raise SystemExit('no map')\n"
         "    if word == 'lose':\n"
         "        work = asyncio.create_task(asyncio.sleep(3600))\n"
         "        work.cancel()\n"
@@ -99,6 +100,14 @@ async def test_end_of_a_hosted_node_has_the_code_of_a_process(module: str, word:
 
 def test_end_by_a_signal_without_a_name_is_described() -> None:
     assert describe_end(-signal.SIGRTMIN - 1) == f"was ended by signal {signal.SIGRTMIN + 1}"
+
+
+async def test_last_words_of_a_hosted_node_are_reported(module: str) -> None:
+    """A process that ends with a text prints it, and its exit code is 1."""
+    lines: list[str] = []
+    node = HostedNode(plan(), command(module, "say"), lines.append, StopTimeouts())
+    assert await node.run() == 1
+    assert lines[1:] == ["/robot/tool: no map", "/robot/tool: ended with exit code 1"]
 
 
 async def test_hosted_node_starts_again_until_it_is_told_to_end(module: str) -> None:

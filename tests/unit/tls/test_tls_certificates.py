@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import ssl
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,40 @@ def test_second_authority_is_refused(folder: CertificateFolder) -> None:
     with pytest.raises(CertificateError, match="there is an authority in"):
         folder.make_authority()
     assert folder.authority.read_bytes() == before
+
+
+def test_authority_that_was_half_made_is_made_again(tmp_path: Path) -> None:
+    """A program was killed between the key and the certificate; nothing had been issued."""
+    folder = CertificateFolder(tmp_path)
+    folder.key(AUTHORITY).write_bytes(b"half")
+    assert "made an authority" in folder.ensure("cloud", ("localhost",))
+    shake_hands(*contexts(folder, "cloud"), "localhost")
+
+
+def test_key_of_an_authority_that_has_issued_is_kept(folder: CertificateFolder) -> None:
+    folder.issue("cloud")
+    folder.authority.unlink()
+    before = folder.key(AUTHORITY).read_bytes()
+    with pytest.raises(CertificateError, match="there is an authority in"):
+        folder.make_authority()
+    assert folder.key(AUTHORITY).read_bytes() == before
+
+
+def test_no_record_is_lost_when_many_programs_issue(folder: CertificateFolder) -> None:
+    names = [f"robot{number}" for number in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda name: CertificateFolder(folder.path).issue(name), names))
+        list(pool.map(lambda name: CertificateFolder(folder.path).revoke(name), names))
+    assert sorted(folder.owners().values()) == sorted(names)
+    assert {one.serial for one in folder.revocations()} == set(folder.owners())
+
+
+def test_validity_beyond_the_calendar_is_refused(tmp_path: Path) -> None:
+    folder = CertificateFolder(tmp_path)
+    for days in (1e7, 1e300):
+        with pytest.raises(CertificateError, match="ends after the year 9999; take fewer days"):
+            folder.make_authority(days)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["authority", "../x", "", ".hidden", "a/b", "x" * 64])
