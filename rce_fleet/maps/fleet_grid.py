@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil, floor, isfinite, sqrt
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 MAX_CELLS = 4_000_000
 """Maximum number of cells, so that a wrong cell size does not fill the memory."""
 BLOCKED_SHARE = 0.1
-"""A cell is blocked if a greater share of its area is occupied or unknown."""
+"""A cell is blocked if a greater share of its area is occupied or unknown, or cut off by what is."""
 LEAST_CELL_SIZE, MOST_CELL_SIZE = 0.001, 1000.0
 """Smallest and largest edge of a cell, metres."""
 _FAR = 1e9
@@ -43,6 +44,9 @@ def fleet_grid(
 ) -> GridMap:
     """Return the grid of cells over a map.
 
+    A wall that is thinner than ``blocked_share`` blocks a cell that it cuts: only the largest of the parts
+    into which it cuts the free area counts as free.
+
     Args:
         drawn: The map.
         cell_size: Edge of a cell, metres.
@@ -50,8 +54,8 @@ def fleet_grid(
             map.
         rows: Number of rows; by default as many as the map needs above the origin.
         columns: Number of columns, likewise.
-        blocked_share: A cell is blocked if more than this share of it is occupied, unknown or outside of the
-            map, 0 .. 1.
+        blocked_share: A cell is blocked if more than this share of it is occupied, unknown, outside of the
+            map or cut off by such places, 0 .. 1.
         max_cells: Maximum number of cells.
 
     Raises:
@@ -78,7 +82,9 @@ def fleet_grid(
             f"a grid of {columns} x {rows} cells is not within 1 .. {max_cells} cells; check cell size and"
             " origin"
         )
-    shares = np.concatenate([_taken(drawn, place, cell_size, row, columns) for row in range(rows)])
+    free = drawn.free
+    look = _Look(drawn, place, cell_size, columns, free, _apart(free))
+    shares = np.concatenate([look.taken(row, blocked_share) for row in range(rows)])
     blocked = np.flatnonzero(shares > blocked_share)
     if len(blocked) == rows * columns:
         raise MapError(
@@ -110,16 +116,75 @@ def _size(drawn: OccupancyMap, place: Pose, cell_size: float) -> tuple[int, int]
     return rows, columns
 
 
-def _taken(drawn: OccupancyMap, place: Pose, cell_size: float, row: int, columns: int) -> NDArray[np.float64]:
-    """Return the shares of a row's cells that are not free, shape (columns,), from evenly spaced points."""
-    # At most a pixel apart, so that no line of pixels lies between two of them.
-    points = min(max(ceil(cell_size / drawn.resolution - 1e-6), 1), _MOST_POINTS)
-    inside = (np.arange(points) + 0.5) / points
-    along = (np.arange(columns)[:, None] + inside).reshape(-1) * cell_size
-    up = (row + inside) * cell_size
-    grid = np.stack(np.broadcast_arrays(along[None, :], up[:, None]), axis=-1)
-    cells = drawn.world_to_cell(transform_points(place.as_array(), grid))
-    on_map = drawn.inside(cells)
-    safe = np.where(on_map[..., None], cells, 0)
-    free = on_map & drawn.free[safe[..., 0], safe[..., 1]]
-    return np.asarray(1.0 - free.reshape(points, columns, points).mean(axis=(0, 2)), np.float64)
+def _apart(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the free pixels without one of each pair that touch at a corner between two others.
+
+    What remains is connected over edges only, also where a turned grid looks at it.
+    """
+    apart = free.copy()
+    low, high = free[:-1], free[1:]
+    apart[:-1, :-1] &= ~(low[:, :-1] & high[:, 1:] & ~low[:, 1:] & ~high[:, :-1])
+    apart[:-1, 1:] &= ~(low[:, 1:] & high[:, :-1] & ~low[:, :-1] & ~high[:, 1:])
+    return apart
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """Looks at the cells of a grid at evenly spaced points.
+
+    Attributes:
+        drawn: The map.
+        place: Outer corner of cell 0 and direction of the columns.
+        cell_size: Edge of a cell, metres.
+        columns: Cells in a row.
+        free: Free pixels of the map.
+        apart: The same, as of :func:`_apart`.
+    """
+
+    drawn: OccupancyMap
+    place: Pose
+    cell_size: float
+    columns: int
+    free: NDArray[np.bool_]
+    apart: NDArray[np.bool_]
+
+    def taken(self, row: int, blocked_share: float) -> NDArray[np.float64]:
+        """Return the shares of a row's cells that are not free, or cut off, shape (columns,)."""
+        # At most a pixel apart, so that no line of pixels lies between two of them.
+        points = min(max(ceil(self.cell_size / self.drawn.resolution - 1e-6), 1), _MOST_POINTS)
+        inside = (np.arange(points) + 0.5) / points
+        along = (np.arange(self.columns)[:, None] + inside).reshape(-1) * self.cell_size
+        up = (row + inside) * self.cell_size
+        grid = np.stack(np.broadcast_arrays(along[None, :], up[:, None]), axis=-1)
+        cells = self.drawn.world_to_cell(transform_points(self.place.as_array(), grid))
+        on_map = self.drawn.inside(cells)
+        safe = np.where(on_map[..., None], cells, 0)
+        at = safe[..., 0], safe[..., 1]
+        shape = points, self.columns, points
+        shares = 1.0 - (on_map & self.free[at]).reshape(shape).mean(axis=(0, 2))
+        unsure = np.flatnonzero((shares > 0) & (shares <= blocked_share))
+        if len(unsure):
+            parts = (on_map & self.apart[at]).reshape(shape)[:, unsure].swapaxes(0, 1)
+            shares[unsure] = np.maximum(shares[unsure], _cut_off(parts))
+        return np.asarray(shares, np.float64)
+
+
+def _cut_off(free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return which share of each cell is not in its largest connected part; 0 for a cell in one part.
+
+    Args:
+        free: Free points of each cell, shape (cells, rows, columns).
+    """
+    from scipy.ndimage import label  # long to load, needed only where something stands in cells
+
+    within = np.zeros((3, 3, 3), np.bool_)
+    within[1] = ((False, True, False), (True, True, True), (False, True, False))
+    labels, count = label(free, within)
+    sizes = np.bincount(labels.reshape(-1), minlength=count + 1)
+    cell_of = np.zeros(count + 1, np.intp)
+    cell_of[labels] = np.arange(len(free))[:, None, None]
+    largest, parts = np.zeros(len(free)), np.zeros(len(free))
+    np.maximum.at(largest, cell_of[1:], sizes[1:])
+    np.add.at(parts, cell_of[1:], 1)
+    area = free.shape[1] * free.shape[2]
+    return np.where(parts > 1, 1.0 - largest / area, 0.0)

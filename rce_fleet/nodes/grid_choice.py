@@ -35,7 +35,7 @@ class GridChoice:
         cell_size: Edge of a cell, metres.
         origin_x, origin_y: Outer corner of cell 0, metres.
         origin_yaw: Direction of the columns, radians.
-        blocked_share: A cell is blocked if more than this share of it is occupied or unknown.
+        blocked_share: A cell is blocked if more than this share of it is occupied, unknown or cut off.
     """
 
     cell_size: float

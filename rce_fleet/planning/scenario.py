@@ -155,9 +155,12 @@ def given_scenario(grid: GridMap, pairs: Iterable[tuple[int, int]], *, seed: int
     """Return a scenario with given starts and goals and without boxes, as in a benchmark.
 
     Raises:
-        ScenarioError: Starts or goals are not all different, or a goal cannot be reached.
+        ScenarioError: There are no pairs, starts or goals are not all different, or a goal cannot be reached.
     """
     rng = Random(seed)  # noqa: S311 - for headings, not for secrets
+    pairs = tuple(pairs)
+    if not pairs:
+        raise ScenarioError("a scenario needs a start and a goal of one robot at least")
     starts, goals = (tuple(cells) for cells in zip(*pairs, strict=True))
     if len(set(starts)) < len(starts) or len(set(goals)) < len(goals):
         raise ScenarioError("two robots have the same start or the same goal; make them different")
@@ -225,11 +228,12 @@ def _way(grid: GridMap, start: int, goal: int) -> list[int]:
 
 def _largest_part(grid: GridMap) -> list[int]:
     """Return the largest connected set of free cells, ascending."""
-    left = set(grid.free)
+    seen: set[int] = set()
     best: set[int] = set()
-    while left:
-        part = grid.reachable(min(left))
-        left -= part
-        if len(part) > len(best):
-            best = part
+    for cell in grid.free:
+        if cell not in seen:
+            part = grid.reachable(cell)
+            seen |= part
+            if len(part) > len(best):
+                best = part
     return sorted(best)

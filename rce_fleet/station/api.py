@@ -43,7 +43,7 @@ class GridRequest(_Model):
     )
     blocked_share: float | None = Field(
         default=None,
-        description="A cell is blocked if more than this share of it is occupied or unknown.",
+        description="A cell is blocked if more than this share of it is occupied, unknown or cut off.",
         ge=0,
         le=1,
     )

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rce_fleet.exceptions import ScenarioError
 from rce_fleet.planning.dijkstra import shortest_path
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.scenario import given_scenario, make_scenario, midway_cell, solvable
+from rce_fleet.planning.scenario import given_scenario, make_scenario, midway_cell, solvable, spread_scenario
 
 
 @settings(max_examples=80, deadline=None)
@@ -68,6 +68,20 @@ def test_given_pairs_are_checked() -> None:
         given_scenario(grid, [(0, 2)])
     with pytest.raises(ScenarioError, match="same"):
         given_scenario(GridMap(), [(0, 5), (0, 6)])
+    with pytest.raises(ScenarioError, match="of one robot at least"):
+        given_scenario(GridMap(), [])
+
+
+def test_a_map_of_many_parts_has_a_scenario() -> None:
+    """Single free cells around a hall; the search for the largest part took minutes."""
+    side = 400
+    apart = {cell for cell in range(side * side) if (cell // side + cell % side) % 2}
+    hall = {row * side + column for row in range(190, 194) for column in range(190, 194)}
+    scenario = spread_scenario(GridMap(side, side, blocked=frozenset(apart - hall)), 3)
+    for cell in (*scenario.starts, *scenario.goals):
+        row, column = divmod(cell, side)
+        assert 189 <= row <= 194
+        assert 189 <= column <= 194
 
 
 @settings(max_examples=40, deadline=None)

@@ -45,6 +45,44 @@ def test_a_line_of_large_pixels_blocks_its_cells() -> None:
     assert fleet_grid(OccupancyMap(data, 0.3)).blocked == {1, 4, 7}
 
 
+def walled(line: np.ndarray, **options: object) -> GridMap:
+    """Return the grid of 3 x 3 m with a wall, given by its occupied pixels of 5 cm."""
+    data = np.zeros((60, 60), np.int8)
+    data[line] = 100
+    return fleet_grid(OccupancyMap(data, 0.05), **options)  # type: ignore[arg-type]
+
+
+ROW, COLUMN = np.indices((60, 60))
+
+
+def test_a_wall_of_one_pixel_blocks_the_cells_that_it_cuts() -> None:
+    assert walled(COLUMN == 30).blocked == {1, 4, 7}
+    assert walled((COLUMN == 30) & (ROW > 10)).blocked == {4, 7}
+    assert walled(ROW == COLUMN).blocked == {0, 4, 8}
+    assert walled(ROW + COLUMN == 59).blocked == {2, 4, 6}
+
+
+def test_what_does_not_cut_a_cell_leaves_it_free() -> None:
+    assert walled((COLUMN == 30) & (ROW != 30)).blocked == {1, 7}  # a gap
+    assert walled(COLUMN == 20).blocked == set()  # along the edge of the cells
+    assert walled((ROW % 10 == 5) & (COLUMN % 10 == 5)).blocked == set()  # single pixels
+    assert walled(ROW + COLUMN == 5).blocked == set()  # it cuts a corner off
+
+
+def test_a_greater_share_leaves_cells_free_that_are_cut() -> None:
+    assert walled(COLUMN == 30, blocked_share=0.6).blocked == set()
+
+
+@pytest.mark.parametrize("yaw", [0.3, pi / 4, 1.2, -0.7])
+@pytest.mark.parametrize("line", [COLUMN == 30, ROW == COLUMN, ROW == COLUMN // 2 + 15])
+def test_a_turned_grid_has_no_leak_in_a_thin_wall(line: np.ndarray, yaw: float) -> None:
+    """The only cell is turned about its centre, through which the wall leads."""
+    half = 0.5 * 2**0.5
+    x, y = (1.525 + half * turn(yaw - 3 * pi / 4) for turn in (cos, sin))
+    with pytest.raises(MapError, match="all 1 cells"):
+        walled(line, origin=Pose(x, y, yaw), rows=1, columns=1, blocked_share=0.3)
+
+
 def test_cells_beyond_the_map_are_blocked() -> None:
     grid = fleet_grid(drawn(), origin=Pose(-2.0, 2.0, 0.0), rows=3, columns=5)
     assert grid.blocked == {0, 2, 4, 5, 9, 10, 11, 12, 13, 14}
