@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 from collections.abc import Iterator
@@ -152,7 +153,9 @@ def _members(folder: Path, count: int) -> list[Member]:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if not path.exists():
-            path.write_text(json.dumps(_free_ports(2 * count)), encoding="utf-8")
+            aside = path.with_name(f".{path.name}.{os.getpid()}")
+            aside.write_text(json.dumps(_free_ports(2 * count)), encoding="utf-8")
+            aside.replace(path)  # a start that is killed leaves no half of it
         ports = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ReplicasError(f"{path} cannot be used: {error}") from error

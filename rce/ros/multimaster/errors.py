@@ -11,6 +11,7 @@
         +-- NothingToRelayError      the type of a topic or service cannot be learned: no node offers it
         +-- LinkFullError            too much waits to be sent on a relay link
         +-- LinkBrokenError          the other end of a relay link breaks its protocol or refuses
+            +-- SecondLinkError      both sides have dialed each other, and the other link is kept
 """
 
 from __future__ import annotations
@@ -64,3 +65,18 @@ class LinkFullError(MultimasterError):
 
 class LinkBrokenError(MultimasterError):
     """The other end of a relay link breaks the protocol or refuses this one."""
+
+
+class SecondLinkError(LinkBrokenError):
+    """Both sides of a relay have dialed each other; their other link is kept.
+
+    Attributes:
+        name: The other side.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.name = name
+
+    def __str__(self) -> str:
+        return f"{self.name} and this side have dialed each other; the other of the two links is kept"

@@ -73,6 +73,8 @@ class Remote(ABC):
         """
         timeout = 0.0
         was_offline = was_away = False
+        fault = ""
+        """Why the last attempt failed; logged once, not each second."""
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(timeout):
@@ -93,8 +95,12 @@ class Remote(ABC):
                     was_offline = True
                     was_away = was_away or not await self._is_reachable()
             except (RosError, OSError) as error:
-                _log.warning("master %s: %s", self.master.name, error)
+                if str(error) != fault:
+                    _log.warning("master %s: %s", self.master.name, error)
+                fault = str(error)
                 timeout = RETRY
+            else:
+                fault = ""
 
     async def _is_reachable(self) -> bool:
         try:

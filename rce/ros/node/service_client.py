@@ -109,10 +109,10 @@ class ServiceClient:
             ServiceFaultError: The provider answered with an error.
             ServiceTimeoutError: No answer within ``timeout`` seconds.
         """
-        if self._closed:
-            raise NodeClosedError(f"the client of {self.name} is closed")
+        self._check_open()
         try:
             async with asyncio.timeout(timeout), self._slots:
+                self._check_open()
                 return await self._exchange(payload)
         except TimeoutError as error:
             await self._drop_idle()
@@ -127,6 +127,10 @@ class ServiceClient:
         self._release(self)
         for call in list(self._open):
             await call.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise NodeClosedError(f"the client of {self.name} is closed")
 
     async def _exchange(self, payload: bytes | bytearray | memoryview) -> bytes:
         call = self._take_idle() or await self._connect()
@@ -170,6 +174,7 @@ class ServiceClient:
         call = await _Call.open(self.name, uri, self._runtime.scratch)
         self._open.add(call)
         try:
+            self._check_open()  # it was closed while this connected
             await self._greet(call)
         except BaseException:
             self._open.discard(call)

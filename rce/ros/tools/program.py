@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import sys
@@ -36,14 +37,39 @@ Values = Annotated[str, typer.Argument(help="Fields as YAML, such as '{data: hel
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")]
 
 
+INTERRUPTED = 130
+"""Exit code of a command that was interrupted before it was done, as of shells after SIGINT."""
+
+
+def _watch(
+    work: Callable[Concatenate[ToolContext, P], Awaitable[None]], *args: P.args, **kwargs: P.kwargs
+) -> None:
+    """Run a command that goes on until it is interrupted; as :func:`_do` else."""
+    with contextlib.suppress(_InterruptedError):
+        _run(work, *args, **kwargs)
+
+
 def _do(
     work: Callable[Concatenate[ToolContext, P], Awaitable[None]], *args: P.args, **kwargs: P.kwargs
 ) -> None:
     """Run a command with a node of its own; print why if it fails.
 
     Raises:
-        typer.Exit: It failed, with code 1.
+        typer.Exit: It failed, with code 1, or was interrupted, with code 130.
     """
+    try:
+        _run(work, *args, **kwargs)
+    except _InterruptedError:
+        raise typer.Exit(INTERRUPTED) from None
+
+
+class _InterruptedError(Exception):
+    """A signal came before the command was done."""
+
+
+def _run(
+    work: Callable[Concatenate[ToolContext, P], Awaitable[None]], *args: P.args, **kwargs: P.kwargs
+) -> None:
     logging.basicConfig(level=logging.ERROR, format="%(message)s")
     try:
         run(_with_node(lambda context: work(context, *args, **kwargs)))
@@ -68,8 +94,9 @@ async def _with_node(work: Callable[[ToolContext], Awaitable[None]]) -> None:
         for task in (told, command):
             task.cancel()
         await asyncio.wait((told, command))
-        if command in done:
-            command.result()
+        if command not in done:
+            raise _InterruptedError
+        command.result()
 
 
 def _show(text: str) -> None:
@@ -104,7 +131,8 @@ def topic_echo(
     no_arrays: Annotated[bool, typer.Option("--noarr", help="Leave arrays out.")] = False,
 ) -> None:
     """Print a topic's messages."""
-    _do(topics.echo, name, count=count, json=json, whole=whole, no_arrays=no_arrays)
+    run_echo = _do if count else _watch
+    run_echo(topics.echo, name, count=count, json=json, whole=whole, no_arrays=no_arrays)
 
 
 @topic.command("hz")
@@ -115,7 +143,8 @@ def topic_hz(
     count: Annotated[int, typer.Option("-n", min=0, help="End after so many lines; 0: never.")] = 0,
 ) -> None:
     """Print a topic's rate."""
-    _do(topics.hz, name, window=window, interval=interval, count=count)
+    run_hz = _do if count else _watch
+    run_hz(topics.hz, name, window=window, interval=interval, count=count)
 
 
 @topic.command("pub")
@@ -129,7 +158,8 @@ def topic_pub(
     latch: Annotated[bool, typer.Option("--latch", "-l", help="Keep it for later subscribers.")] = False,
 ) -> None:
     """Publish on a topic."""
-    _do(topics.publish, name, kind, values, rate=rate, latch=latch)
+    run_pub = _watch if rate or latch else _do
+    run_pub(topics.publish, name, kind, values, rate=rate, latch=latch)
 
 
 @service.command("list")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from functools import partial
@@ -11,6 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from support.multimaster import STRING, node
+from support.ports import free_ports
 from support.relays import (
     check_that_all_that_is_latched_is_heard,
     heard_at_once,
@@ -23,6 +25,7 @@ from support.slow_link import SlowLink
 from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceError, ServiceFaultError
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
+from rce.ros.node import Subscriber
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
 
@@ -115,6 +118,42 @@ async def test_calls_that_a_slow_link_cannot_hold_fail(large: str, monkeypatch: 
         assert 1 <= len(failures) < count, results
         assert all("connection is too slow" in failure.text for failure in failures)
         assert not [result for result in results if isinstance(result, Exception) and result not in failures]
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])
+async def test_sides_that_dial_each_other_keep_one_link(names: tuple[str, str]) -> None:
+    """Over two links each message came twice."""
+    ports = free_ports(2)
+    async with AsyncExitStack() as stack:
+        cores = [await stack.enter_async_context(Core(port=0)) for _ in range(2)]
+        for core, name, port, other in zip(cores, names, ports, reversed(ports), strict=True):
+            dialed = (("127.0.0.1", other),)
+            await stack.enter_async_context(
+                sync_of(core, relay_name=name, relay_listen=port, relay_addr="127.0.0.1", relay_to=dialed)
+            )
+        talker = await stack.enter_async_context(node("talker", cores[0].uri))
+        listener = await stack.enter_async_context(node("listener", cores[1].uri))
+        said = await talker.advertise("said", STRING)
+        heard = await listener.subscribe("said", STRING)
+        await published_until_heard(said, heard)
+        clean = 0
+        for turn in range(100):
+            texts = [f"{turn} {number}" for number in range(5)]
+            for text in (*texts, f"end {turn}"):
+                said.publish(data=text)
+            found = [message async for message in until_text(heard, f"end {turn}")]
+            clean = clean + 1 if [text for text in found if text in texts] == texts else 0
+            if clean == 30:  # more than one attempt to dial
+                return
+            await asyncio.sleep(0.2)
+        raise AssertionError("messages come twice, or are lost")
+
+
+async def until_text(subscriber: Subscriber, last: str) -> AsyncIterator[str]:
+    """Yield the texts that come, the last one excluded, and what follows it at once."""
+    async with asyncio.timeout(20):
+        while (text := (await anext(aiter(subscriber))).data) != last:
+            yield text
 
 
 async def test_a_link_brings_messages_only_while_there_is_a_subscriber() -> None:

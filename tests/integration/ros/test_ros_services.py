@@ -13,6 +13,7 @@ from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import (
+    NodeClosedError,
     ServiceFaultError,
     ServiceLostError,
     ServiceNotFoundError,
@@ -266,6 +267,26 @@ async def test_request_and_fields_together_are_refused(make_node: MakeNode) -> N
         client = a.service_client("switch", SET_BOOL)
         with pytest.raises(TypeError, match="timeout"):
             await client({"data": True}, timeout=1)
+
+
+async def test_calls_that_wait_for_their_turn_end_with_the_client(make_node: MakeNode) -> None:
+    """They called a provider that hangs after the close, and waited for good."""
+    called = asyncio.Event()
+
+    async def hang(_: Message) -> dict[str, Any]:
+        called.set()
+        await asyncio.Event().wait()
+        return {}
+
+    async with make_node("a") as a, make_node("b") as b:
+        await a.advertise_service("s", SET_BOOL, hang)
+        client = b.service_client("s", SET_BOOL)
+        client._slots = asyncio.Semaphore(1)
+        calls = [asyncio.create_task(client.call({"data": True})) for _ in range(3)]
+        await asyncio.wait_for(called.wait(), 20)
+        await client.close()
+        results = await asyncio.wait_for(asyncio.gather(*calls, return_exceptions=True), 20)
+        assert [type(result) for result in results] == [ServiceLostError, NodeClosedError, NodeClosedError]
 
 
 async def test_closed_clients_are_not_kept(make_node: MakeNode) -> None:

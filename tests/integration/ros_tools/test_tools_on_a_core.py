@@ -14,7 +14,7 @@ import pytest
 
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -83,6 +83,29 @@ async def test_messages_are_published() -> None:
         process.send_signal(signal.SIGINT)
         output, _ = await process.communicate()
         assert process.returncode == 0, output.decode()
+
+
+async def test_an_interrupted_command_tells_that_it_was_not_done() -> None:
+    called = asyncio.Event()
+
+    async def hang(_: Message) -> dict[str, object]:
+        called.set()
+        await asyncio.Event().wait()
+        return {}
+
+    async with talking() as (core, node):
+        await node.advertise_service("switch", "std_srvs/SetBool", hang)
+        call = await start(core, "service", "call", "/switch", "true")
+        await asyncio.wait_for(called.wait(), 60)
+        call.send_signal(signal.SIGINT)
+        output, _ = await call.communicate()
+        assert call.returncode == 130, output.decode()
+        echo = await start(core, "topic", "echo", "/chat")
+        assert echo.stdout is not None
+        await echo.stdout.readline()
+        echo.send_signal(signal.SIGINT)
+        await echo.communicate()
+        assert echo.returncode == 0
 
 
 async def test_a_rate_is_shown() -> None:

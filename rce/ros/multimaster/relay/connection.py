@@ -156,6 +156,10 @@ class RelayConnection(asyncio.Protocol):
             if loop.time() - self._heard > SILENCE:
                 self._fail(LinkBrokenError("the other side fell silent"))
 
+    def end(self, error: LinkBrokenError) -> None:
+        """Close now; who waits for the end gets the error."""
+        self._fail(error)
+
     def abort(self) -> None:
         """Close now."""
         if self._transport is not None:

@@ -13,7 +13,7 @@ from rce.aio.tasks import TaskScope, errors_in
 from rce.dialing import open_socket
 from rce.guard import Lobby, LogThrottle
 from rce.ros.errors import RosError
-from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
+from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError, SecondLinkError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
@@ -69,9 +69,19 @@ def check_listening(host: str, token: str) -> None:
 def broken_by(failure: Exception) -> LinkBrokenError:
     """Turn the failure of an end, or a group of them, into the error that ends this link, and no other."""
     error = next(errors_in(failure)) if isinstance(failure, ExceptionGroup) else failure
+    if isinstance(error, LinkBrokenError):
+        return error
     if not isinstance(error, RosError | OSError):
         _log.error("an end of a relay failed", exc_info=failure)
     return LinkBrokenError(str(error) or type(error).__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _OtherSide:
+    """The other side of a link: its name, and whether this side has dialed it."""
+
+    name: str
+    is_dialed: bool
 
 
 class RelayLinks:
@@ -80,8 +90,10 @@ class RelayLinks:
     def __init__(self, identity: LinkIdentity, make_ends: MakeEnds) -> None:
         self._identity = identity
         self._make_ends = make_ends
-        self._running: dict[RelayConnection, str] = {}
-        """The links and the names of their other sides: a side that dials again may have two for a while."""
+        self._running: dict[RelayConnection, _OtherSide] = {}
+        """The links and their other sides: a side that dials again may have two for a while."""
+        self._next_end = asyncio.Event()
+        """Set, and replaced by a new one, when a link has ended."""
         self._guests: asyncio.Queue[RelayConnection] = asyncio.Queue(MAX_NEW)
         self._lobby = Lobby("relay links", per_address=UNAUTHENTICATED_PER_ADDRESS, in_all=UNAUTHENTICATED)
         self._throttle = LogThrottle()
@@ -91,7 +103,7 @@ class RelayLinks:
     @property
     def connected(self) -> set[str]:
         """Names of the sides that are linked now."""
-        return set(self._running.values())
+        return {other.name for other in self._running.values()}
 
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""
@@ -103,7 +115,10 @@ class RelayLinks:
                 async with asyncio.timeout(CONNECT_TIMEOUT):
                     sock = await open_socket(host, port)
                     _, link = await loop.create_connection(RelayConnection, sock=sock)
-                await self._serve(link, self._greet_as_dialer)
+                await self._serve(link, self._greet_as_dialer, is_dialed=True)
+            except SecondLinkError as error:
+                _log.info("relay to %s:%d: %s", host, port, error)
+                await self._until_unlinked(error.name)
             except (OSError, LinkBrokenError) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)
             if loop.time() - begin > WORKED_AFTER:
@@ -143,15 +158,20 @@ class RelayLinks:
 
     async def _serve_guest(self, link: RelayConnection) -> None:
         try:
-            await self._serve(link, self._greet_as_listener)
+            await self._serve(link, self._greet_as_listener, is_dialed=False)
+        except SecondLinkError as error:
+            _log.info("relay link from %s: %s", link.address, error)
         except LinkBrokenError as error:
             if self._throttle.is_due(link.address, asyncio.get_running_loop().time()):
                 _log.warning("relay link from %s: %s", link.address, error)
 
-    async def _serve(self, link: RelayConnection, greet: Callable[[RelayConnection], Awaitable[str]]) -> None:
+    async def _serve(
+        self, link: RelayConnection, greet: Callable[[RelayConnection], Awaitable[str]], *, is_dialed: bool
+    ) -> None:
         """Run a link until it ends.
 
         Raises:
+            SecondLinkError: Both sides have dialed each other, and the other link is kept.
             LinkBrokenError: The other side breaks the protocol, has another token or fell silent.
         """
         try:
@@ -163,7 +183,9 @@ class RelayLinks:
             except (ValueError, TypeError, ArithmeticError, LookupError) as error:
                 raise LinkBrokenError(f"a handshake that cannot be understood: {error}") from error
             link.become_known()
-            await self._run(link, name)
+            other = _OtherSide(name, is_dialed)
+            await self._be_the_only_one(other)
+            await self._run(link, other)
         finally:
             link.abort()
             await link.gone.wait()
@@ -192,9 +214,39 @@ class RelayLinks:
         link.send(hello)
         return name
 
-    async def _run(self, link: RelayConnection, name: str) -> None:
+    async def _be_the_only_one(self, other: _OtherSide) -> None:
+        """End the link that the other side has made, or this one: over two, each message comes twice.
+
+        Both sides keep the one that the side with the smaller name has dialed. Several sides of one name are
+        not told apart: none of the links that one side accepted ends.
+
+        Raises:
+            SecondLinkError: The other link is kept.
+        """
+        own, name = self._identity.name, other.name
+        if own == name:
+            return
+        error = SecondLinkError(name)
+        for link in self._made_otherwise(other):
+            if other.is_dialed != (own < name):
+                raise error
+            link.end(error)
+        while self._made_otherwise(other):
+            await self._next_end.wait()
+
+    def _made_otherwise(self, other: _OtherSide) -> list[RelayConnection]:
+        twin = _OtherSide(other.name, not other.is_dialed)
+        return [link for link, side in self._running.items() if side == twin]
+
+    async def _until_unlinked(self, name: str) -> None:
+        """Wait until no link with a side runs."""
+        while name in self.connected:
+            await self._next_end.wait()
+
+    async def _run(self, link: RelayConnection, other: _OtherSide) -> None:
+        name = other.name
         _log.info("relay link with %s", name)
-        self._running[link] = name
+        self._running[link] = other
         try:
             async with TaskScope() as tasks:
                 exporter, importer = self._make_ends(link.send, tasks, name)
@@ -210,3 +262,5 @@ class RelayLinks:
             raise broken_by(group) from group
         finally:
             del self._running[link]
+            self._next_end.set()
+            self._next_end = asyncio.Event()
