@@ -72,7 +72,7 @@ async def change_robot(call: Call) -> FleetAnswer:
 
 async def pause(call: Call) -> FleetAnswer:
     """Let a robot stand still; it keeps its task."""
-    return await _set_mode(call, "paused", "paused")
+    return await _set_mode(call, "paused", "paused", unless_out=True)
 
 
 async def resume(call: Call) -> FleetAnswer:

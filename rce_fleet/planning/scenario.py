@@ -127,7 +127,8 @@ def _draw(
     known_grid = grid.with_blocked(grid.blocked.union(known))
     ways = [cell for robot in range(robots) for cell in _way(known_grid, starts[robot], goals[robot])]
     rng.shuffle(ways)
-    hidden = _place_boxes(known_grid, [cell for cell in [*ways, *spare] if cell in spare], boxes[1])
+    placeable = set(spare)
+    hidden = _place_boxes(known_grid, [cell for cell in [*ways, *spare] if cell in placeable], boxes[1])
     headings = tuple(rng.choice(_HEADINGS) for _ in starts)
     for told, found in ((known, hidden), (known, ()), ((), hidden)):
         if solvable(grid.with_blocked(grid.blocked.union(told, found)), starts, goals):

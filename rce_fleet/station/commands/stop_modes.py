@@ -67,6 +67,10 @@ class StopModes:
         self._changed = asyncio.Event()
         self._set_at: dict[str, float] = {}
         """When the planner accepted a mode last, for each robot."""
+        self._free_since: dict[str, float] = {}
+        """Since when a released robot is shown in another mode than stopped, though none was set."""
+        self._paid: set[str] = set()
+        """Robots whose mode of before the planner has accepted."""
         self._told: set[str] = set()
         """Robots of which an event told that the planner refuses their mode."""
 
@@ -120,24 +124,40 @@ class StopModes:
             await self._set_stopped(robot, self._view.own_mode_of(robot), user)
 
     async def _set_stopped(self, robot: str, mode: str, user: str) -> None:
-        if self._owed.get(robot) is None:
+        # One that was paused meanwhile must not drive at its release.
+        owed = self._owed.get(robot)
+        if owed is None or (mode == PAUSED != owed.mode):
             self._owed.owe(robot, OwedMode(mode=mode, user=user))
             await self._save()
+        self._paid.discard(robot)
         await self._set(robot, STOPPED, "", user)
 
     async def _release(self, robot: str, shown: str) -> None:
-        """Give a robot, or the fleet, its mode of before; one that a person set meanwhile stays."""
+        """Give a robot, or the fleet, its mode of before; one that a person set meanwhile stays.
+
+        A planner that has just started shows its own modes until the manager gives it those that it had.
+        """
         owed = self._owed.get(robot)
         if owed is None or shown in ("", MANUAL):
             return
         if shown == STOPPED:
             reason = "" if owed.mode == AUTOMATIC else f"as before the emergency stop by {owed.user}"
-            await self._set(robot, owed.mode, reason, owed.user)
-        elif _now() - self._set_at.get(robot, -inf) > SHOWN_WAIT_S:  # else stopped may not be shown yet
+            self._free_since.pop(robot, None)
+            if await self._set(robot, owed.mode, reason, owed.user):
+                self._paid.add(robot)
+        elif robot in self._paid or self._is_shown_for_long(robot):
             self._owed.forget(robot)
             self._told.discard(robot)
+            self._paid.discard(robot)
+            self._free_since.pop(robot, None)
 
-    async def _set(self, robot: str, mode: str, reason: str, user: str) -> None:
+    def _is_shown_for_long(self, robot: str) -> bool:
+        """Return whether a released robot is in another mode than stopped, not just before or after it."""
+        since = self._free_since.setdefault(robot, _now())
+        return _now() - max(since, self._set_at.get(robot, -inf)) > SHOWN_WAIT_S
+
+    async def _set(self, robot: str, mode: str, reason: str, user: str) -> bool:
+        """Set a mode; return whether the planner has accepted it."""
         try:
             await self._fleet.set_mode(robot, mode, reason=reason, user=user)
         except PlannerUnavailableError:
@@ -147,8 +167,9 @@ class StopModes:
                 self._told.add(robot)
                 what = robot or "the fleet"
                 self._fleet.take_event(f"the planner does not take that {what} is {mode}: {error}", "bad")
-        else:
-            self._set_at[robot] = _now()
+            return False
+        self._set_at[robot] = _now()
+        return True
 
     async def _save(self) -> None:
         if self._owed.is_saved:

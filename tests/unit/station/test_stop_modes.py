@@ -34,11 +34,15 @@ class Planner:
 
     def __init__(self, view: FleetView) -> None:
         self._view = view
-        self._planner = FleetPlanner(GridMap())
         self.now = 0.0
-        self.is_away = False
         self.calls: list[tuple[str, str]] = []
         self.events: list[str] = []
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew, with all robots in their mode of the start."""
+        self._planner = FleetPlanner(GridMap())
+        self.is_away = False
         for number, name in enumerate(NAMES):
             self._planner.handle(PoseSeen(name, 0.5 + 2 * number, 0.5, 0.0), self.now)
         self._show()
@@ -159,6 +163,53 @@ async def test_a_mode_that_a_person_set_meanwhile_stays(site: Site) -> None:
     await site.stop("Robot1", stopped=False)
     await site.until(lambda: not site.owed.robots)
     assert site.shown()[0] == "out_of_service"
+
+
+async def test_a_robot_that_was_paused_meanwhile_stays_so(site: Site) -> None:
+    await site.stop("Robot1")
+    await site.until(lambda: site.shown()[0] == "stopped")
+    await site.planner.set_mode("Robot1", "paused", reason="tea", user="ben")
+    await site.until(lambda: site.shown()[0] == "stopped")
+    await site.stop("Robot1", stopped=False)
+    await site.until(lambda: not site.owed.robots)
+    assert site.shown()[0] == "paused"
+
+
+async def test_a_fleet_that_was_paused_meanwhile_stays_so(site: Site) -> None:
+    await site.stop()
+    await site.until(lambda: site.view.mode == "stopped")
+    await site.planner.set_mode("", "paused", reason="tea", user="ben")
+    await site.until(lambda: site.view.mode == "stopped")
+    await site.stop(stopped=False)
+    await site.until(lambda: not site.owed.robots)
+    assert site.view.mode == "paused"
+
+
+async def test_a_stop_that_a_new_planner_hears_later_is_released(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It begins with automatic, and gets the modes of before from the manager some seconds later."""
+    monkeypatch.setattr(module, "SHOWN_WAIT_S", 60.0)
+    await site.stop()
+    await site.until(lambda: site.view.mode == "stopped")
+    site.planner.is_away = True
+    await site.stop(stopped=False)
+    site.modes._set_at.clear()  # long ago
+    site.planner.restart()
+    await asyncio.sleep(0.2)  # some looks
+    await site.planner.set_mode("", "stopped", reason="", user="manager")
+    await site.until(lambda: not site.owed.robots)
+    assert site.view.mode == "automatic"
+
+
+async def test_a_stop_of_a_person_after_the_release_stays(site: Site) -> None:
+    await site.stop()
+    await site.until(lambda: site.view.mode == "stopped")
+    await site.stop(stopped=False)
+    await site.until(lambda: not site.owed.robots)
+    await site.planner.set_mode("", "stopped", reason="", user="ben")
+    await asyncio.sleep(0.2)
+    assert site.view.mode == "stopped"
 
 
 async def test_a_stop_of_another_program_is_not_released(site: Site) -> None:
