@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import ceil, floor, isfinite, sqrt
 from typing import TYPE_CHECKING
 
@@ -45,7 +44,8 @@ def fleet_grid(
     """Return the grid of cells over a map.
 
     A wall that is thinner than ``blocked_share`` blocks a cell that it cuts: only the largest of the parts
-    into which it cuts the free area counts as free.
+    into which it cuts the free area counts as free. One that lies between two cells blocks the one that has
+    more of it.
 
     Args:
         drawn: The map.
@@ -82,10 +82,8 @@ def fleet_grid(
             f"a grid of {columns} x {rows} cells is not within 1 .. {max_cells} cells; check cell size and"
             " origin"
         )
-    free = drawn.free
-    look = _Look(drawn, place, cell_size, columns, free, _apart(free))
-    shares = np.concatenate([look.taken(row, blocked_share) for row in range(rows)])
-    blocked = np.flatnonzero(shares > blocked_share)
+    look = _Look(drawn, place, cell_size, columns, blocked_share)
+    blocked = np.flatnonzero(look.shut(rows))
     if len(blocked) == rows * columns:
         raise MapError(
             f"all {rows * columns} cells of {cell_size} m are blocked; check the origin, choose smaller"
@@ -128,45 +126,119 @@ def _apart(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return apart
 
 
-@dataclass(frozen=True, slots=True)
 class _Look:
     """Looks at the cells of a grid at evenly spaced points.
 
-    Attributes:
+    Args:
         drawn: The map.
         place: Outer corner of cell 0 and direction of the columns.
         cell_size: Edge of a cell, metres.
         columns: Cells in a row.
-        free: Free pixels of the map.
-        apart: The same, as of :func:`_apart`.
+        blocked_share: Share of a cell that may be taken or cut off.
     """
 
-    drawn: OccupancyMap
-    place: Pose
-    cell_size: float
-    columns: int
-    free: NDArray[np.bool_]
-    apart: NDArray[np.bool_]
-
-    def taken(self, row: int, blocked_share: float) -> NDArray[np.float64]:
-        """Return the shares of a row's cells that are not free, or cut off, shape (columns,)."""
+    def __init__(
+        self, drawn: OccupancyMap, place: Pose, cell_size: float, columns: int, blocked_share: float
+    ) -> None:
+        self._drawn = drawn
+        self._place = place.as_array()
+        self._cell_size = cell_size
+        self._columns = columns
+        self._share = blocked_share
+        self._free = drawn.free
+        self._apart = _apart(self._free)
         # At most a pixel apart, so that no line of pixels lies between two of them.
-        points = min(max(ceil(self.cell_size / self.drawn.resolution - 1e-6), 1), _MOST_POINTS)
+        self._points = min(max(ceil(cell_size / drawn.resolution - 1e-6), 1), _MOST_POINTS)
+
+    def shut(self, rows: int) -> NDArray[np.bool_]:
+        """Return which cells are blocked, shape (rows * columns,)."""
+        shares = np.zeros((rows, self._columns))
+        below: NDArray[np.bool_] | None = None
+        divided: list[tuple[int, int]] = []
+        """Neighbours with a wall between them, as numbers of cells."""
+        for row in range(rows):
+            shares[row], parts = self._look_at(row)
+            first = row * self._columns
+            along = self._divided(shares[row, :-1], shares[row, 1:], parts[:-1], parts[1:], axis=2)
+            divided += [(first + cell, first + cell + 1) for cell in along]
+            if below is not None:
+                up = self._divided(shares[row - 1], shares[row], below, parts, axis=1)
+                divided += [(first - self._columns + cell, first + cell) for cell in up]
+            below = parts
+        taken = shares.reshape(-1)
+        shut = taken > self._share
+        for one, other in divided:
+            if not (shut[one] or shut[other]):
+                shut[one if taken[one] > taken[other] else other] = True
+        return shut
+
+    def _look_at(self, row: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Look at a row of cells.
+
+        Returns:
+            The shares of the cells that are not free, or cut off, shape (columns,); and which of their points
+            are free and not connected over corners, shape (columns, points, points).
+        """
+        points, columns = self._points, self._columns
         inside = (np.arange(points) + 0.5) / points
-        along = (np.arange(self.columns)[:, None] + inside).reshape(-1) * self.cell_size
-        up = (row + inside) * self.cell_size
+        along = (np.arange(columns)[:, None] + inside).reshape(-1) * self._cell_size
+        up = (row + inside) * self._cell_size
         grid = np.stack(np.broadcast_arrays(along[None, :], up[:, None]), axis=-1)
-        cells = self.drawn.world_to_cell(transform_points(self.place.as_array(), grid))
-        on_map = self.drawn.inside(cells)
+        cells = self._drawn.world_to_cell(transform_points(self._place, grid))
+        on_map = self._drawn.inside(cells)
         safe = np.where(on_map[..., None], cells, 0)
         at = safe[..., 0], safe[..., 1]
-        shape = points, self.columns, points
-        shares = 1.0 - (on_map & self.free[at]).reshape(shape).mean(axis=(0, 2))
-        unsure = np.flatnonzero((shares > 0) & (shares <= blocked_share))
+        shape = points, columns, points
+        shares = 1.0 - (on_map & self._free[at]).reshape(shape).mean(axis=(0, 2))
+        parts = (on_map & self._apart[at]).reshape(shape).swapaxes(0, 1)
+        unsure = np.flatnonzero((shares > 0) & (shares <= self._share))
         if len(unsure):
-            parts = (on_map & self.apart[at]).reshape(shape)[:, unsure].swapaxes(0, 1)
-            shares[unsure] = np.maximum(shares[unsure], _cut_off(parts))
-        return np.asarray(shares, np.float64)
+            shares[unsure] = np.maximum(shares[unsure], _cut_off(parts[unsure]))
+        return shares, parts
+
+    def _divided(
+        self,
+        shares: NDArray[np.float64],
+        others: NDArray[np.float64],
+        parts: NDArray[np.bool_],
+        beside: NDArray[np.bool_],
+        *,
+        axis: int,
+    ) -> list[int]:
+        """Return which cells have a wall between them and the next one.
+
+        Args:
+            shares: Shares of cells that are not free, shape (N,).
+            others: The same of the next cells.
+            parts: Free points of the cells, shape (N, points, points).
+            beside: The same of the next cells.
+            axis: Along which axis of the points the next cells follow.
+        """
+        free = (shares <= self._share) & (others <= self._share)
+        pairs = np.flatnonzero(free & ((shares > 0) | (others > 0)))
+        if not len(pairs):
+            return []
+        joined = _are_joined(parts[pairs], beside[pairs], axis, 1.0 - self._share)
+        return [int(pair) for pair in pairs[~joined]]
+
+
+def _label(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Return the connected parts of each cell's free points.
+
+    Args:
+        free: Free points of each cell, shape (cells, rows, columns).
+
+    Returns:
+        Numbers of the parts, from 1, of the shape of ``free``; and the cell of each part, shape (parts + 1,).
+    """
+    from scipy.ndimage import label  # long to load, needed only where something stands in cells
+
+    within = np.zeros((3, 3, 3), np.bool_)
+    within[1] = ((False, True, False), (True, True, True), (False, True, False))
+    labels, count = label(free, within)
+    cell_of = np.zeros(count + 1, np.intp)
+    cell_of[labels] = np.arange(len(free))[:, None, None]
+    return labels, cell_of
 
 
 def _cut_off(free: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -175,16 +247,36 @@ def _cut_off(free: NDArray[np.bool_]) -> NDArray[np.float64]:
     Args:
         free: Free points of each cell, shape (cells, rows, columns).
     """
-    from scipy.ndimage import label  # long to load, needed only where something stands in cells
-
-    within = np.zeros((3, 3, 3), np.bool_)
-    within[1] = ((False, True, False), (True, True, True), (False, True, False))
-    labels, count = label(free, within)
-    sizes = np.bincount(labels.reshape(-1), minlength=count + 1)
-    cell_of = np.zeros(count + 1, np.intp)
-    cell_of[labels] = np.arange(len(free))[:, None, None]
+    labels, cell_of = _label(free)
+    sizes = np.bincount(labels.reshape(-1), minlength=len(cell_of))
     largest, parts = np.zeros(len(free)), np.zeros(len(free))
     np.maximum.at(largest, cell_of[1:], sizes[1:])
     np.add.at(parts, cell_of[1:], 1)
     area = free.shape[1] * free.shape[2]
     return np.where(parts > 1, 1.0 - largest / area, 0.0)
+
+
+def _are_joined(
+    free: NDArray[np.bool_], beside: NDArray[np.bool_], axis: int, share: float
+) -> NDArray[np.bool_]:
+    """Return whether a way leads from each cell to the one beside it that stays within both.
+
+    It must lead from the largest free part of each, or from one that is ``share`` of the cell.
+
+    Args:
+        free: Free points of each cell, shape (cells, rows, columns).
+        beside: The same of the cells beside.
+        axis: Along which axis they lie beside each other, 1 or 2.
+        share: As above.
+    """
+    labels, cell_of = _label(np.concatenate((free, beside), axis))
+    is_enough = np.ones(len(cell_of), np.bool_)
+    for half in np.split(labels, 2, axis):
+        sizes = np.bincount(half.reshape(-1), minlength=len(cell_of))
+        largest = np.zeros(len(free))
+        np.maximum.at(largest, cell_of[1:], sizes[1:])
+        area = free.shape[1] * free.shape[2]
+        is_enough &= sizes >= np.minimum(largest, share * area)[cell_of]
+    joined = np.zeros(len(free), np.bool_)
+    joined[cell_of[1:][is_enough[1:]]] = True
+    return joined

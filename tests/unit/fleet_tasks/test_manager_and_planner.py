@@ -178,6 +178,18 @@ async def test_a_request_reaches_the_planner_after_a_kill(tmp_path: Path) -> Non
     await third.manager.close()
 
 
+@pytest.mark.parametrize("change", ["pause", "resume"])
+async def test_a_robot_that_is_out_is_not_brought_back(client: ManagerClient, change: str) -> None:
+    """A script that pauses and resumes every robot put those into service that a person had taken out."""
+    client.manager.facts.is_current = True
+    client.manager.planner_began(PlannerRun("1", "8 x 8"))
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    assert (await client.ask("POST", "/robots/Robot1/take-out"))[0] == 200
+    status, body, _ = await client.ask("POST", f"/robots/Robot1/{change}")
+    assert (status, "put it in" in str(body)) == (409, True)
+    assert client.manager.book.entry("Robot1").mode == "out_of_service"
+
+
 async def test_a_mode_that_the_planner_refuses_stays(client: ManagerClient) -> None:
     client.manager.facts.is_current = True
     client.manager.planner_began(PlannerRun("1", "8 x 8"))

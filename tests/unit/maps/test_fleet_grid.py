@@ -64,9 +64,27 @@ def test_a_wall_of_one_pixel_blocks_the_cells_that_it_cuts() -> None:
 
 def test_what_does_not_cut_a_cell_leaves_it_free() -> None:
     assert walled((COLUMN == 30) & (ROW != 30)).blocked == {1, 7}  # a gap
-    assert walled(COLUMN == 20).blocked == set()  # along the edge of the cells
     assert walled((ROW % 10 == 5) & (COLUMN % 10 == 5)).blocked == set()  # single pixels
     assert walled(ROW + COLUMN == 5).blocked == set()  # it cuts a corner off
+
+
+@pytest.mark.parametrize("at", range(2, 58))
+def test_a_wall_blocks_cells_wherever_it_stands(at: int) -> None:
+    """Also on an edge, or so near to it that it cuts off less than the share: then cells of one side."""
+    near = {(at - 2) // 20, (at + 2) // 20}
+    columns = [frozenset({place, place + 3, place + 6}) for place in near]
+    rows = [frozenset({3 * place, 3 * place + 1, 3 * place + 2}) for place in near]
+    assert walled(np.equal(COLUMN, at)).blocked in columns
+    assert walled(np.equal(ROW, at)).blocked in rows
+
+
+def test_a_thick_wall_across_an_edge_blocks_one_side() -> None:
+    grid = walled((COLUMN >= 38) & (COLUMN < 42))
+    assert grid.blocked in ({1, 4, 7}, {2, 5, 8})
+
+
+def test_cells_with_a_gap_between_them_are_joined() -> None:
+    assert walled((COLUMN == 20) & (ROW % 20 > 9)).blocked == set()
 
 
 def test_a_greater_share_leaves_cells_free_that_are_cut() -> None:
