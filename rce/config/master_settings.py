@@ -33,7 +33,7 @@ class MasterSettings(Section, frozen=True, kw_only=True):
     lease: Annotated[
         Finite,
         Meta(ge=2, le=60),
-        Setting("Seconds; with etcd: how long a leading master that fell silent keeps the lead."),
+        Setting("Seconds; with etcd: how long a leading master that fell silent keeps the lead, 2 to 60."),
     ] = 3.0
     advertise: Annotated[
         Host,

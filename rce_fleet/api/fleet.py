@@ -56,8 +56,8 @@ class FleetRobotModel(ApiModel):
 
     id: str
     state: str = Field(
-        description="joining, stopping, silent, unreachable, driving, waiting, arrived, idle, or its mode;"
-        " away: not known to the planner."
+        description="joining, stopping, silent, lost, unreachable, driving, waiting, arrived, idle, or its"
+        " mode; away: not known to the planner."
     )
     activity: str = Field(
         description="task, charging, waiting for a charger, parking, idle, paused, out or by hand."

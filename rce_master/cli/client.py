@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rce_master.cli.credentials import Credentials
 
 OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
+OfUserByAdmin = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
 
 REQUEST_S = 30.0
 CONNECT_S = 3.0

@@ -224,7 +224,8 @@ def move(
     """Hand a container over to another machine while it runs; administrators only.
 
     It is started there first and then dropped here, with the containers that share a private network with
-    it. One with volumes is ended first, and its volumes move with it. All else that it holds is lost.
+    it. One with volumes is ended first, and its volumes move with it. All else that it holds is lost, except
+    the state of nodes that keep it (`state` in the container's config).
     """
     run(_move(container, machine, user, wait=wait))
 

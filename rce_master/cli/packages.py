@@ -17,7 +17,7 @@ from rich.table import Table
 from rce.packages import BadArchiveError, SigningKey, key_id, statement
 from rce.packages.folder import Source, look_into
 from rce_master.cli import credentials, signing_key
-from rce_master.cli.client import ApiClient, OfUser, of_user, run
+from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
 from rce_master.cli.exceptions import CliError
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ async def _show(name: str, version: str, user: str) -> None:
 def remove(
     name: Annotated[str, typer.Argument(help="Name of the package.")],
     version: Annotated[str, typer.Argument(help="Version of the package.")],
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
 ) -> None:
     """Remove a version that no node needs."""
     run(_remove(name, version, user))

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, OfUser, of_user, run
+from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
 from rce_master.cli.exceptions import CliError
 
 app = typer.Typer(no_args_is_help=True, help="List and remove saved states of nodes.")
@@ -40,7 +40,7 @@ async def _list(user: str) -> None:
 @app.command("remove")
 def remove(
     node: Annotated[str, typer.Argument(metavar="CONTAINER/NODE", help="Whose state.")],
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Remove the saved state of a node."""

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, OfUser, of_user, run
+from rce_master.cli.client import ApiClient, OfUserByAdmin, of_user, run
 from rce_master.cli.exceptions import NotLoggedInError
 
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
@@ -35,7 +35,7 @@ async def _print() -> None:
 
 
 @tokens.command("list")
-def list_tokens(user: OfUser = "") -> None:
+def list_tokens(user: OfUserByAdmin = "") -> None:
     """List your tokens, with expiry and last use."""
     run(_list("/tokens", user))
 
@@ -48,7 +48,7 @@ def new_token(
     ] = False,
     label: Label = "",
     days: Days = 0.0,
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
 ) -> None:
     """Make and print a token for a program."""
     if metrics == fleet:
@@ -60,7 +60,7 @@ def new_token(
 @tokens.command("revoke")
 def revoke_tokens(
     ids: Annotated[list[str], typer.Argument(metavar="ID...", help="As rce token list shows them.")],
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
 ) -> None:
     """Revoke tokens; what was opened by them ends."""
     run(_revoke("/tokens", ids, user))
@@ -72,7 +72,7 @@ def add_robot(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the token that it has.")] = False,
     label: Label = "",
     days: Days = 0.0,
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
 ) -> None:
     """Make and print a token that is valid for this robot ID only: "token" in the robot's file."""
     body = {"robot": robot, "label": label, "days": days, "replace": replace}
@@ -80,14 +80,15 @@ def add_robot(
 
 
 @robots.command("list")
-def list_robots(user: OfUser = "") -> None:
+def list_robots(user: OfUserByAdmin = "") -> None:
     """List the robots that have a token."""
     run(_list("/robot-tokens", user))
 
 
 @robots.command("revoke")
 def revoke_robots(
-    names: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Robot IDs.")], user: OfUser = ""
+    names: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Robot IDs.")],
+    user: OfUserByAdmin = "",
 ) -> None:
     """Revoke robots' tokens; their sessions end."""
     run(_revoke("/robot-tokens", names, user))

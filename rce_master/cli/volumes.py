@@ -11,7 +11,7 @@ from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
-from rce_master.cli.client import ApiClient, OfUser, of_user, run
+from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
 
 app = typer.Typer(no_args_is_help=True, help="List and remove volumes of containers.")
 
@@ -51,7 +51,7 @@ def _or_dash(one: dict[str, Any], *keys: str) -> list[str]:
 @app.command("remove")
 def remove(
     name: Annotated[str, typer.Argument(help="Name of the volume.")],
-    user: OfUser = "",
+    user: OfUserByAdmin = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Remove a volume and all its files."""

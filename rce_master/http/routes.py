@@ -287,4 +287,8 @@ def route_table(group: str) -> routes.RouteTable[Route]:
     return routes.RouteTable(group, Route)
 
 
-OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists all users'.")
+OF_USER = Query(
+    name="user",
+    description="Whose. Those of others are for administrators; to be read for viewers and operators too, but"
+    " tokens. Default: own, in lists all users'.",
+)

@@ -105,7 +105,11 @@ def _show(text: str) -> None:
 
 
 @topic.command("list")
-def topic_list(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show types.")] = False) -> None:
+def topic_list(
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show types, and how many nodes publish and subscribe.")
+    ] = False,
+) -> None:
     """List the topics."""
     _do(topics.list_topics, verbose=verbose)
 
