@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +57,7 @@ class SlamGraphNode:
         self._node = node
         self._parameters = parameters
         self._throttled_log = ThrottledLog(node)
-        self._session = SlamGraphSession(replace(parameters, load_map=False, localize_only=False))
+        self._session = SlamGraphSession(parameters)
         self._turn = asyncio.Lock()
         self._scans: asyncio.Queue[tuple[str, LaserRecord]] = asyncio.Queue()
         self._robots: list[MappedRobot] = []
@@ -77,7 +76,8 @@ class SlamGraphNode:
         node, parameters = self._node, self._parameters
         await asyncio.to_thread(compile_kernels)
         try:
-            self._session = await asyncio.to_thread(SlamGraphSession, parameters)
+            if parameters.load_map or parameters.localize_only:
+                await asyncio.to_thread(self._session.load)
         except MapError as error:
             self._fault = str(error)
             node.log.error("the map cannot be loaded: %s", error)  # noqa: TRY400 - the user's file

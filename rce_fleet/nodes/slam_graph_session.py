@@ -28,11 +28,10 @@ POSE_NUMBERS = 3
 class SlamGraphSession:
     """One map and the robots in it. Its methods may take long, and are called by one thread at a time.
 
+    The map is empty until :meth:`load`; with ``localize_only`` scans are left out until then.
+
     Args:
         parameters: The node's parameters.
-
-    Raises:
-        MapError: The parameters name a map file that cannot be used.
     """
 
     def __init__(self, parameters: SlamGraphParameters) -> None:
@@ -43,8 +42,6 @@ class SlamGraphSession:
         if len(parameters.initial_pose) == POSE_NUMBERS:
             self._start = np.array(parameters.initial_pose, np.float64)
         self._drawn: tuple[tuple[int, int], OccupancyMap] | None = None
-        if parameters.load_map or parameters.localize_only:
-            self.load()
 
     @property
     def graph(self) -> KeyGraph:
@@ -63,12 +60,17 @@ class SlamGraphSession:
 
     def jump(self, robot: str) -> str:
         """Return how a robot's odometry jumped at its last scan; empty if it did not."""
-        return self._localizers[robot].jump if self._parameters.localize_only else self._mapper.jump(robot)
+        if not self._parameters.localize_only:
+            return self._mapper.jump(robot)
+        localizer = self._localizers.get(robot)
+        return "" if localizer is None else localizer.jump
 
     def add(self, robot: str, record: LaserRecord) -> NDArray[np.float64] | None:
         """Take a scan; return ``map_from_odom``, shape (3,), or None while the robot's place is not known."""
         odometry = np.array(record.odometry)
         if self._parameters.localize_only:
+            if not len(self.graph):
+                return None
             localizer = self._localizers.get(robot)
             if localizer is None:
                 localizer = GraphLocalizer(

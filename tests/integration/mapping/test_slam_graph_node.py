@@ -14,6 +14,7 @@ from rce.ros.node import Node
 from rce.ros.tf import Transform, TransformBroadcaster, TransformListener
 from rce_fleet.geometry.angles import quaternion_z
 from rce_fleet.geometry.poses import compose, inverse, relative
+from rce_fleet.mapping.graph.storage import load_graph
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import read_map
 from rce_fleet.nodes.slam_graph import SlamGraphNode
@@ -243,6 +244,43 @@ async def test_a_saved_map_is_loaded_again(tmp_path: Path) -> None:
         grid = read_map(world.maps[-1])
         row, column = grid.world_to_cell(wall[:2])
         assert grid.data[row - 2 : row + 3, column].max() == 100
+
+
+async def test_without_its_map_the_node_does_not_map(tmp_path: Path) -> None:
+    """With localize_only it publishes nothing before the map is loaded, and does not change it then."""
+    file, other = tmp_path / "hall.npz", tmp_path / "elsewhere.npz"
+    values: dict[str, Any] = {"map_file": str(file), "use_odom_topic": True}
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start(values)
+        robot = Robot(world.judge, "", ONE, 1)
+        await robot.start()
+        await world.drive(robot)
+        saved = (await world.call("/slam_graph/save_map")).message
+    poses = load_graph(file).poses.copy()
+    file.rename(other)
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start({**values, "localize_only": True, "initial_pose": [0.0, 0.0, 0.0]})
+        await world.until(lambda: any("nothing to localize in" in text for text in world.heard))
+        robot = Robot(world.judge, "", ONE, 3)
+        await robot.start()
+        await world.drive(robot)
+        assert not (await world.call("/dynamic_map", "nav_msgs/GetMap")).map.data
+        assert not world.maps
+        assert not world.slam._transforms
+        refused = await world.call("/slam_graph/save_map")
+        assert "no scans yet" in refused.message
+        assert not file.exists()
+        assert not (await world.call("/slam_graph/load_map")).success
+        other.rename(file)
+        assert (await world.call("/slam_graph/load_map")).success
+        world.slam.mapped.clear()
+        await world.drive(robot)
+        assert await world.error_of(robot, ONE[0]) < 0.1
+        await world.until(lambda: world.maps)
+        assert (await world.call("/slam_graph/save_map")).message == saved
+    assert np.array_equal(load_graph(file).poses, poses)
 
 
 async def test_a_new_map_can_begin_at_a_given_pose() -> None:
