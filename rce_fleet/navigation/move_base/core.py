@@ -167,6 +167,7 @@ class MoveBase:
         self._recovery = None
         self._waits_for_plan = False
         self._moved_from = None
+        self._now = now
         self._begin_times_anew(now)
 
     def cancel(self) -> None:
@@ -199,9 +200,11 @@ class MoveBase:
             situation: What is known.
             costs: The global costmap.
         """
-        if situation.now < self._now - TIME_JUMP:
+        passed = situation.now - self._now
+        if passed < -TIME_JUMP:
             self._begin_times_anew(situation.now)
             self._has_begun = False
+            passed = 0.0
         self._now = situation.now
         if self._ending is not None:
             ending, text = self._ending
@@ -210,8 +213,8 @@ class MoveBase:
         if self.state is State.IDLE:
             return Decision()
         if situation.problem:
-            # Patience begins anew: the robot stands because it must not drive, not because it cannot.
-            self._begin_times_anew(situation.now)
+            # This time does not count: the robot stands because it must not drive, not because it cannot.
+            self._leave_out(passed)
             self._local.stand()
             return Decision(text=situation.problem)
         self._watch_motion(situation)
@@ -312,6 +315,12 @@ class MoveBase:
         self._valid_plan_at = self._valid_control_at = self._moved_at = now
         self._retries = 0
         self._asked_at = float("-inf")
+
+    def _leave_out(self, seconds: float) -> None:
+        """Let all limits of time be reached so much later."""
+        self._valid_plan_at += seconds
+        self._valid_control_at += seconds
+        self._moved_at += seconds
 
     def _end(self, ending: Ending | None = None, text: str = "") -> None:
         self._machine.advance(Event.END)

@@ -149,6 +149,56 @@ def test_a_problem_stops_the_robot_until_it_is_gone() -> None:
     assert robot.run(30.0).ending is Ending.SUCCEEDED
 
 
+def run_with_problems(robot: Robot, seconds: int) -> Decision:
+    """Run with one late transform every second."""
+    decision = Decision()
+    for _ in range(seconds):
+        robot.problem = "transforms are late"
+        robot.step()
+        robot.problem = ""
+        decision = robot.run(0.9)
+        if decision.ending is not None:
+            break
+    return decision
+
+
+def test_short_problems_do_not_keep_a_blocked_robot() -> None:
+    """The time before a problem counts, only that of the problem does not."""
+    order: list[str] = []
+    robot = Robot(MoveBaseParameters(controller_timeout=3.0), [Noted("a", order)])
+    robot.obstacles = np.array([(1.25, y) for y in np.linspace(0, 2, 41)])
+    robot.core.start(robot.now)
+    run_with_problems(robot, 3)
+    assert order == []
+    decision = run_with_problems(robot, 10)
+    assert order == ["a"]
+    assert decision.ending is Ending.ABORTED
+
+
+def test_short_problems_do_not_hide_oscillation() -> None:
+    order: list[str] = []
+    robot = Robot(MoveBaseParameters(oscillation_timeout=3.0), [Noted("a", order)])
+    robot.core.start(robot.now)
+    for step in range(50):
+        robot.pose = HERE  # it slips
+        robot.problem = "transforms are late" if step % 10 == 0 else ""
+        robot.step()
+    assert order == ["a"]
+
+
+def test_time_without_a_goal_does_not_add_to_patience() -> None:
+    """The first control step after a goal may have a problem, a long time after the one before it."""
+    robot = Robot(MoveBaseParameters(planner_timeout=2.0))
+    robot.plan = NO_WAY
+    robot.step()
+    robot.now += 1000.0
+    robot.core.start(robot.now)
+    robot.problem = "transforms are late"
+    robot.step()
+    robot.problem = ""
+    assert robot.run(10.0).ending is Ending.ABORTED
+
+
 def test_after_a_problem_the_robot_drives_straight_on() -> None:
     """It was far along its path, which it does not follow from the beginning again."""
     robot = Robot(MoveBaseParameters())
