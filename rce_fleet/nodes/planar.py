@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _LEAST_TURN = 1e-3
 """A quaternion shorter than this is not a rotation."""
+_NO_TURN = (0.0, 0.0, 0.0, 1.0)
 _UP = Vector(0.0, 0.0, 1.0)
 
 
@@ -49,16 +50,20 @@ def read_pose(message: Message) -> Pose:
     Raises:
         ValueError: A number is not finite, or the orientation is not a rotation about z.
     """
-    at, turn = message.position, message.orientation
-    values = (at.x, at.y, turn.x, turn.y, turn.z, turn.w)
-    if not all(map(isfinite, values)):
+    turn = message.orientation
+    return _pose_in_plane(message.position, (turn.x, turn.y, turn.z, turn.w))
+
+
+def _pose_in_plane(at: Message, turn: tuple[float, float, float, float]) -> Pose:
+    """Return the pose of a position and of a quaternion x, y, z, w; raise as :func:`read_pose`."""
+    if not all(map(isfinite, (at.x, at.y, *turn))):
         raise ValueError(f"the pose ({at.x}, {at.y}) has numbers that are not finite")
-    length = sum(value * value for value in (turn.x, turn.y, turn.z, turn.w)) ** 0.5
+    length = sum(value * value for value in turn) ** 0.5
     if length < _LEAST_TURN:
         raise ValueError(
             "the orientation is (0, 0, 0, 0), which is not a rotation; (0, 0, 0, 1) is straight ahead"
         )
-    x, y, z, w = (value / length for value in (turn.x, turn.y, turn.z, turn.w))
+    x, y, z, w = (value / length for value in turn)
     if x * x + y * y > 0.1:  # noqa: PLR2004 - upright by less than about 35 degrees
         raise ValueError("the orientation is not a rotation about z: the robot would not stand upright")
     return Pose(at.x, at.y, yaw_of(x, y, z, w))
@@ -87,13 +92,16 @@ def path_fields(poses: NDArray[np.float64], header: dict[str, Any]) -> dict[str,
 
 
 def read_map(message: Message) -> OccupancyMap:
-    """Return a ``nav_msgs/OccupancyGrid``.
+    """Return a ``nav_msgs/OccupancyGrid``. An origin with the orientation (0, 0, 0, 0) is not turned.
 
     Raises:
         ValueError: Its size, resolution, values or origin are not those of a map.
     """
     info = message.info
-    values, place = np.asarray(message.data, np.int16), read_pose(info.origin)
+    values, turn = np.asarray(message.data, np.int16), info.origin.orientation
+    quaternion = (turn.x, turn.y, turn.z, turn.w)
+    # octomap_server and others never set it, and ROS's nodes read past it.
+    place = _pose_in_plane(info.origin.position, quaternion if any(quaternion) else _NO_TURN)
     try:
         return OccupancyMap.from_message(info.width, info.height, values, info.resolution, place)
     except MapError as error:

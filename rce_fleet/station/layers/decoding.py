@@ -108,6 +108,9 @@ class LayerDecoder:
         self._grid = None
         info = message.info
         x, y, yaw = _plane_of(info.origin)
+        turn = info.origin.orientation
+        if not any((turn.x, turn.y, turn.z, turn.w)):
+            yaw = 0.0  # octomap_server and others never set it
         try:
             whole = OccupancyMap.from_message(
                 info.width, info.height, message.data, info.resolution, Pose(x, y, yaw)

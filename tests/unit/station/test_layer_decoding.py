@@ -107,6 +107,12 @@ def test_a_map_keeps_origin_and_rotation() -> None:
     assert (cells_of(data) == room().view(np.uint8)).all()
 
 
+def test_an_origin_without_orientation_is_not_turned() -> None:
+    """As octomap_server publishes it."""
+    origin = {"position": {"x": -1.0, "y": 2.0}, "orientation": {}}
+    assert decoded("map", **grid("map", STAMP, room(), origin)).fields["origin"] == [-1.0, 2.0, 0.0]
+
+
 @pytest.mark.parametrize(
     ("info", "words"),
     [
