@@ -96,6 +96,7 @@ class SlamGmappingNode:
             parameters,
             np.random.default_rng(None if parameters.seed < 0 else parameters.seed),
             parameters.map_start_pose,
+            keeps_way=False,
         )
         self._watch = OdometryWatch()
         self._throttled_log = ThrottledLog(node)
@@ -208,9 +209,8 @@ class SlamGmappingNode:
     def _publish_pose(self, stamp: Time) -> None:
         """Publish where the robot was at a scan, and how far the particles are apart."""
         found = self._filter
-        spread = np.cov(found.poses.T, aweights=found.weights, ddof=0).reshape(3, 3)
         frame = self._listener.resolve(self._parameters.map_frame)
-        pose = pose_with_covariance_fields(Pose.from_array(found.estimate), spread)
+        pose = pose_with_covariance_fields(Pose.from_array(found.estimate), found.covariance)
         self._poses.publish(header={"stamp": stamp, "frame_id": frame}, pose=pose)
 
     def _publish(self, stamp: Time) -> None:

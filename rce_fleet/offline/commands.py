@@ -151,7 +151,7 @@ def corrected(records: Iterable[LaserRecord]) -> Iterator[Recorded]:
 
     Wheels slip, and some robots record backward motion as forward; AMCL's model of odometry has neither.
     """
-    tracker = GridFilter(FilterParameters(particles=1), np.random.default_rng(0))
+    tracker = GridFilter(FilterParameters(particles=1), np.random.default_rng(0), keeps_way=False)
     for record in records:
         tracker.add(record)
         scan = LaserScan(

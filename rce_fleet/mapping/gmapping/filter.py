@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.geometry.angles import wrap_array
+from rce_fleet.geometry.angles import circular_mean, wrap_array
 from rce_fleet.geometry.poses import compose, relative
 from rce_fleet.mapping.gmapping.motion import LEAST_STD, motion_std, prior_information
 from rce_fleet.mapping.gmapping.particles import (
@@ -85,6 +85,7 @@ class GridFilter:
         parameters: GMapping's.
         rng: Source of randomness; the same seed gives the same result.
         start: Pose of the first scan on the map, shape (3,).
+        keeps_way: Keep where the particles were at each scan.
 
     Attributes:
         poses: shape (particles, 3): x, y, yaw.
@@ -97,6 +98,8 @@ class GridFilter:
         parameters: FilterParameters,
         rng: np.random.Generator,
         start: tuple[float, ...] = (0.0, 0.0, 0.0),
+        *,
+        keeps_way: bool = True,
     ) -> None:
         number = parameters.particles
         self.parameters = parameters
@@ -104,6 +107,7 @@ class GridFilter:
         self.weights = np.full(number, 1 / number)
         self.store = TileStore(number, parameters.delta)
         self.ancestry = Ancestry()
+        self._keeps_way = keeps_way
         self._log_weights = np.zeros(number)
         self._rng = rng
         self._odometry: Reals | None = None
@@ -138,6 +142,14 @@ class GridFilter:
         return compose(self.poses[self.best], self._motion)
 
     @property
+    def covariance(self) -> Reals:
+        """Covariance of the particles' poses, shape (3, 3)."""
+        spread = self.poses.copy()
+        # Headings on both sides of pi are close to each other.
+        spread[:, 2] = wrap_array(spread[:, 2] - circular_mean(spread[:, 2], self.weights))
+        return np.cov(spread.T, aweights=self.weights, ddof=0).reshape(3, 3)
+
+    @property
     def tracked(self) -> Reals:
         """Odometry as corrected by matching each scan with what was seen just before, shape (3,)."""
         return compose(self._base, self._motion)
@@ -165,6 +177,8 @@ class GridFilter:
         self._base = self.tracked
         self._odometry, self._time = odometry, record.time
         self._motion, self._driven = np.zeros(3), np.zeros(3)
+        if not self._keeps_way:
+            self.ancestry = Ancestry()
         self.ancestry.append(self.poses)
         self.weights = normalized(self._log_weights, self.parameters.gain)
         if self.effective < self.parameters.resample_threshold * len(self.poses):
@@ -186,7 +200,10 @@ class GridFilter:
         self._jumped = True
 
     def path(self) -> Reals:
-        """Return the poses of the best particle at the scans that were used, shape (K, 3)."""
+        """Return the poses of the best particle at the scans that were used, shape (K, 3).
+
+        Without ``keeps_way``, this is its pose at the last one.
+        """
         return self.ancestry.path(self.best)
 
     def _prepare(self, record: LaserRecord) -> _Scan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import log
 
 import numpy as np
@@ -155,6 +156,47 @@ def test_ancestry_follows_resampled_particles() -> None:
     ways.choose(np.array([1, 2, 2]))
     assert ways.path(0)[:, 0].tolist() == [2, 6]
     assert ways.path(1)[:, 0].tolist() == [0, 7]
+
+
+@pytest.mark.parametrize("resample_threshold", [0.0, 1.1])
+def test_a_filter_without_the_way_keeps_one_entry(resample_threshold: float) -> None:
+    """A node runs for months; the map is the same as with the way."""
+    parameters = replace(QUICK, resample_threshold=resample_threshold)
+    _, records = drive(30)
+    whole = GridFilter(parameters, np.random.default_rng(0))
+    short = GridFilter(parameters, np.random.default_rng(0), keeps_way=False)
+    for record in records:
+        whole.add(record)
+        short.add(record)
+        assert len(short.path()) == 1
+    assert len(whole.path()) > 5
+    assert np.array_equal(whole.path()[-1], short.path()[0])
+    assert np.array_equal(whole.poses, short.poses)
+
+
+def test_the_node_does_not_keep_the_way() -> None:
+    parameters = SlamGmappingParameters(particles=1, linear_update=0.0, seed=1)
+    node = SlamGmappingNode(ClockOnly(), parameters)  # type: ignore[arg-type] # it stands for one
+    for record in drive(4)[1]:
+        node._use(record)
+    assert len(node._filter.path()) == 1
+
+
+def test_headings_around_pi_have_a_small_covariance() -> None:
+    """Else a robot that faces -x would count as lost."""
+    found = GridFilter(FilterParameters(particles=4), np.random.default_rng(0))
+    found.poses = np.array([(0.0, 1.0, 3.13), (0.2, 1.0, -3.13), (0.0, 1.0, 3.13), (0.2, 1.0, -3.13)])
+    half = np.pi - 3.13
+    assert found.covariance == pytest.approx(
+        np.array([(0.01, 0, 0.1 * half), (0, 0, 0), (0.1 * half, 0, half**2)]), abs=1e-9
+    )
+
+
+def test_the_covariance_follows_the_weights() -> None:
+    found = GridFilter(FilterParameters(particles=2), np.random.default_rng(0))
+    found.poses = np.array([(0.0, 0.0, 0.1), (1.0, 0.0, -0.1)])
+    found.weights = np.array([0.75, 0.25])
+    assert found.covariance == pytest.approx(np.cov(found.poses.T, aweights=found.weights, ddof=0), abs=1e-6)
 
 
 class ClockOnly:
