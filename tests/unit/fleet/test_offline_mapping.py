@@ -164,6 +164,28 @@ def test_scans_of_a_bag_without_numbers_are_left_out(tmp_path: Path, wrong: str)
     assert "are not finite; left out" in found.faults[0]
 
 
+def test_scans_of_a_bag_without_increment_are_left_out(tmp_path: Path) -> None:
+    """All their beams would point the same way."""
+    records = drive(4)[1]
+    records[1] = replace(records[1], angle_increment=0.0)
+    write_bag(tmp_path / "run.bag", records)
+    found = read_log(tmp_path / "run.bag")
+    assert len(found.records) == 3
+    assert all(record.angle_increment for record in found.records)
+    (fault,) = found.faults
+    assert (
+        fault
+        == f"{tmp_path / 'run.bag'}: angle_increment of the scan at {records[1].time:.3f} s is 0; left out"
+    )
+
+
+def test_a_bag_whose_scans_have_no_increment_is_refused(tmp_path: Path) -> None:
+    records = [replace(record, angle_increment=0.0) for record in drive(4)[1]]
+    write_bag(tmp_path / "run.bag", records)
+    with pytest.raises(LogError, match="the topic /scan has no usable message"):
+        read_log(tmp_path / "run.bag")
+
+
 @pytest.mark.parametrize("content", [None, "", "ODOM 0 0 0 0 0 0 1 host 1\n"])
 def test_unusable_logs_end_with_a_message(tmp_path: Path, content: str | None) -> None:
     log = tmp_path / "bad.log"
