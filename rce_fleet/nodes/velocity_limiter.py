@@ -2,8 +2,9 @@
 
 It subscribes to ``raw_cmd_vel``, ``scan`` and ``odom`` (or tf), and publishes ``cmd_vel``. A number on
 ``speed_limit`` is the highest speed that passes, in m/s, until another comes; 0 ends it. A message true on
-``emergency_stop``, or the service ``~set_emergency_stop``, stops the robot until false releases it. The work
-is done by :mod:`rce_fleet.navigation.safety`.
+``emergency_stop``, or the service ``~set_emergency_stop``, stops the robot until false releases it on the
+same way: a release that comes again when a network is back does not end a stop that was made at the robot.
+The work is done by :mod:`rce_fleet.navigation.safety`.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class VelocityLimiterNode:
             await node.subscribe("odom", "nav_msgs/Odometry", self._take_odometry)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             await node.subscribe("raw_cmd_vel", "geometry_msgs/Twist", self._take_command)
-            await node.subscribe("emergency_stop", "std_msgs/Bool", lambda message: self._halt(message.data))
+            await node.subscribe("emergency_stop", "std_msgs/Bool", self._take_stop)
             await node.subscribe("speed_limit", "std_msgs/Float64", self._take_speed_limit)
             await node.advertise_service("~set_emergency_stop", "std_srvs/SetBool", self._answer_stop)
             told = float("-inf")
@@ -175,19 +176,27 @@ class VelocityLimiterNode:
 
     # Emergency stop
 
-    def _halt(self, stop: bool) -> None:
+    def _halt(self, way: str, *, stop: bool) -> str:
+        """Stop the robot, or end the stop of this way; return what holds now."""
+        limiter, before = self._limiter, self._limiter.emergency
+        way = self._node.resolve(way)
         if stop:
-            self._limiter.stop("emergency stop")
-            self._node.log.error("emergency stop: the robot stands until it is released")
-        elif self._limiter.emergency:
-            self._limiter.release()
-            self._node.log.warning("the emergency stop was released")
-        self._stopped.publish(data=stop)
+            limiter.stop(f"emergency stop by {way}", way)
+            self._node.log.error("emergency stop by %s: the robot stands until false releases it there", way)
+        else:
+            limiter.release(way)
+        text = f"stopped: {limiter.emergency}" if limiter.emergency else "released"
+        if not stop and limiter.emergency != before:
+            self._node.log.warning("the emergency stop by %s was ended; the robot is %s", way, text)
+        self._stopped.publish(data=bool(limiter.emergency))
         self._pass_on()
+        return text
+
+    def _take_stop(self, message: Message) -> None:
+        self._halt("emergency_stop", stop=message.data)
 
     def _answer_stop(self, request: Message) -> dict[str, Any]:
-        self._halt(request.data)
-        return {"success": True, "message": "stopped until released" if request.data else "released"}
+        return {"success": True, "message": self._halt("~set_emergency_stop", stop=request.data)}
 
     # What goes out
 

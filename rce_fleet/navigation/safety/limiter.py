@@ -74,14 +74,14 @@ class VelocityLimiter:
         footprint: The robot's outline.
 
     Attributes:
-        emergency: Why the robot is stopped until :meth:`release`; empty if it is not.
         speed_limit: Highest speed where the robot is, metres per second; infinity: the stage's own.
     """
 
     def __init__(self, parameters: SafetyParameters, footprint: Footprint) -> None:
         self.parameters = parameters
         self.footprint = footprint
-        self.emergency = ""
+        self._stops: dict[str, str] = {}
+        """Why the robot is stopped, by the way on which it was."""
         self.speed_limit = inf
         self.seen = SeenPoints(parameters.memory)
         self._command = STANDING
@@ -89,6 +89,11 @@ class VelocityLimiter:
         self._pose: Pose | None = None
         self._posed_at = float("-inf")
         self._now = float("-inf")
+
+    @property
+    def emergency(self) -> str:
+        """Why the robot is stopped until :meth:`release`; empty if it is not."""
+        return "; ".join(self._stops.values())
 
     # What comes in
 
@@ -110,14 +115,19 @@ class VelocityLimiter:
         """Take a scan."""
         self.seen.take(scan)
 
-    def stop(self, reason: str) -> None:
-        """Stop the robot until :meth:`release` is called."""
-        self.emergency = reason or "emergency stop"
+    def stop(self, reason: str, way: str = "") -> None:
+        """Stop the robot until :meth:`release` is called for the same way.
 
-    def release(self) -> None:
-        """End an emergency stop. Commands from before do not count any more."""
-        self.emergency = ""
-        self._commanded_at = float("-inf")
+        Args:
+            reason: Why.
+            way: How the stop came, such as the name of a topic. The robot stands while any way stops it.
+        """
+        self._stops[way] = reason or "emergency stop"
+
+    def release(self, way: str = "") -> None:
+        """End the emergency stop of a way. Commands from before do not count any more."""
+        if self._stops.pop(way, None) is not None:
+            self._commanded_at = float("-inf")
 
     # What goes out
 

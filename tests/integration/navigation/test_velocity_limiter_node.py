@@ -160,3 +160,37 @@ async def test_a_robot_of_unknown_outline_stands_and_says_why() -> None:
                 pass
         while not senses.passed.empty():
             assert senses.passed.get_nowait() == Twist()
+
+
+async def test_an_old_release_does_not_end_a_stop_by_service() -> None:
+    """As the station's last message, which comes again when the robot's network is back."""
+    async with stage(Transform()) as senses:
+        node, stopped = senses.node, asyncio.Queue[bool]()
+        await node.subscribe(
+            "velocity_limiter/emergency_stopped", "std_msgs/Bool", lambda said: stopped.put_nowait(said.data)
+        )
+        topic = await node.advertise("emergency_stop", "std_msgs/Bool")
+        await topic.wait_for_subscribers(timeout=60)
+        service = node.service_client("velocity_limiter/set_emergency_stop", "std_srvs/SetBool")
+
+        async def told(expected: bool) -> None:
+            assert await asyncio.wait_for(stopped.get(), 60) is expected
+
+        await told(False)
+        assert (
+            await service(data=True)
+        ).message == "stopped: emergency stop by /velocity_limiter/set_emergency_stop"
+        await told(True)
+        await senses.wait_for(lambda twist: twist == Twist())
+        topic.publish(data=False)
+        await told(True)
+        while not senses.passed.empty():
+            assert senses.passed.get_nowait() == Twist()
+        topic.publish(data=True)
+        await told(True)
+        answer = await service(data=False)
+        assert (answer.success, answer.message) == (True, "stopped: emergency stop by /emergency_stop")
+        await told(True)
+        topic.publish(data=False)
+        await told(False)
+        await senses.wait_for(lambda twist: twist == AHEAD)

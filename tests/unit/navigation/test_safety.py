@@ -169,6 +169,19 @@ def test_an_emergency_stop_holds_until_released() -> None:
     assert stage.limit(0.2).twist == Twist(0.3, 0.0)
 
 
+def test_a_stop_is_released_only_on_its_own_way() -> None:
+    stage = limiter()
+    stage.stop("by a person", "service")
+    stage.stop("by the station", "topic")
+    stage.release("topic")
+    stage.take_command(Twist(0.3, 0.0), 0.0)
+    assert stage.limit(0.0).reason == stage.emergency == "by a person"
+    stage.release("service")
+    stage.release("topic")
+    stage.take_command(Twist(0.3, 0.0), 0.1)
+    assert (stage.emergency, stage.limit(0.1).twist) == ("", Twist(0.3, 0.0))
+
+
 @pytest.mark.parametrize("twist", [Twist(nan, 0.0), Twist(0.1, inf)])
 def test_a_command_that_is_not_finite_stops_the_robot(twist: Twist) -> None:
     stage = limiter()
