@@ -137,6 +137,10 @@ class MoveBase:
         self._machine = MOVE_BASE.start(State.IDLE, "")
         self._path = np.empty((0, 3))
         self._next_recovery = 0
+        self._stuck_at: Pose | None = None
+        """Where the first recovery behavior began, in the global costmap's frame."""
+        self._led_away = 0.0
+        """How far from there recovery behaviors ended, metres."""
         self._recovery: Recovery | None = None
         self._has_begun = False
         """Whether the recovery behavior was started, in the time that is now."""
@@ -164,9 +168,8 @@ class MoveBase:
         self._path = np.empty((0, 3))
         self._local.follow(self._path)
         self._next_recovery, self._cause, self._ending = 0, "", None
-        self._recovery = None
+        self._recovery = self._stuck_at = self._moved_from = None
         self._waits_for_plan = False
-        self._moved_from = None
         self._now = now
         self._begin_times_anew(now)
 
@@ -217,11 +220,11 @@ class MoveBase:
             self._leave_out(passed)
             self._local.stand()
             return Decision(text=situation.problem)
+        if self.state is State.RECOVERING:
+            return self._recover(situation)
         self._watch_motion(situation)
         if self.state is State.CONTROLLING:
             return self._control(situation, costs)
-        if self.state is State.RECOVERING:
-            return self._recover(situation)
         step = self._local.step(situation.pose, situation.measured, situation.obstacles, situation.dt)
         return Decision(step.twist, wants_plan=self._wants_plan(situation.now))
 
@@ -274,11 +277,14 @@ class MoveBase:
         return bool(((found >= INSCRIBED) & (found != UNKNOWN)).any())
 
     def _watch_motion(self, situation: Situation) -> None:
-        """Note when the robot has moved on; then recovery begins with its first behavior again."""
-        at, start = situation.global_pose, self._moved_from
-        if start is None or hypot(at.x - start.x, at.y - start.y) >= self.parameters.oscillation_distance:
-            if start is not None:
-                self._next_recovery = 0
+        """Note when the robot has moved on; then recovery begins with its first behavior again.
+
+        What a recovery behavior drives does not count, nor the way back to where the robot was stuck.
+        """
+        at, far = situation.global_pose, self.parameters.oscillation_distance
+        if self._stuck_at is not None and _distance(at, self._stuck_at) >= self._led_away + far:
+            self._next_recovery, self._stuck_at = 0, None
+        if self._moved_from is None or _distance(at, self._moved_from) >= far:
             self._moved_at, self._moved_from = situation.now, at
 
     # Recovering
@@ -294,6 +300,8 @@ class MoveBase:
 
     def _recover(self, situation: Situation) -> Decision:
         if self._recovery is None:
+            if self._next_recovery == 0:
+                self._stuck_at, self._led_away = situation.global_pose, 0.0
             self._recovery = self._recoveries[self._next_recovery]
             self._next_recovery += 1
             self.recovered += 1
@@ -307,6 +315,9 @@ class MoveBase:
         name = self._recovery.name
         self._machine.advance(Event.RECOVERED)
         self._local.reset()
+        self._moved_from = None
+        if self._stuck_at is not None:
+            self._led_away = max(self._led_away, _distance(situation.global_pose, self._stuck_at))
         self._begin_times_anew(situation.now)
         return Decision(text=f"{self._cause}; recovery '{name}' {step.text}")
 
@@ -328,3 +339,7 @@ class MoveBase:
         self._path = np.empty((0, 3))
         if ending is not None:
             self._ending = (ending, text)
+
+
+def _distance(one: Pose, other: Pose) -> float:
+    return hypot(one.x - other.x, one.y - other.y)
