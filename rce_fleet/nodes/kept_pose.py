@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from rce_fleet.geometry.angles import wrap
-from rce_fleet.geometry.jumps import OdometryWatch
+from rce_fleet.geometry.jumps import OdometryWatch, has_begun_anew
 from rce_fleet.geometry.poses import Pose
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-ORIGIN_M = 0.1
-"""Odometry nearer to its origin than this, metres, has begun anew if it was farther away before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +82,10 @@ class StoredPose:
             time: Seconds of ROS time now.
         """
         kept = self.kept
-        was_away = hypot(kept.odometry.x, kept.odometry.y) >= ORIGIN_M
-        has_begun_anew = was_away and hypot(odometry.x, odometry.y) < ORIGIN_M
         watch = OdometryWatch()
         watch.check(kept.odometry, self.time)
-        if boot == self.boot and not has_begun_anew and not watch.check(odometry, time):
+        is_same = boot == self.boot and not has_begun_anew(kept.odometry, odometry)
+        if is_same and not watch.check(odometry, time):
             return kept
         return KeptPose(kept.frame, kept.pose, kept.covariance, odometry)
 

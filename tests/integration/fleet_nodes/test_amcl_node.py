@@ -18,6 +18,7 @@ from rce.ros.node import Node
 from rce.ros.tf import TransformListener
 from rce.ros.types import Message, Time
 from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.jumps import PAUSE_SHARE
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.parameters import LaserModel
 from rce_fleet.nodes.amcl import AmclNode
@@ -291,6 +292,20 @@ async def test_odometry_that_jumps_keeps_the_pose() -> None:
         here.robot.odometry = Pose(-70.0, 30.0, 2.0)
         pose = await here.drive(1)
         await here.says("the odometry jumped")
+        assert here.error(pose)[0] < 0.4
+        assert here.error(await here.drive(8))[0] < 0.15
+
+
+async def test_odometry_that_begins_anew_keeps_the_pose() -> None:
+    """The robot's driver was restarted: its stamps say that the robot could have driven there meanwhile."""
+    async with world() as here:
+        here.robot.odometry = Pose(3.0, 2.0, 2.0)
+        await here.drive(3)
+        before, last = (each.header.stamp.to_sec() for each in here.poses[-2:])
+        await here.judge.sleep(1.5 + PAUSE_SHARE * (last - before))
+        here.robot.odometry = ORIGIN
+        pose = await here.pose_at(here.robot.publish())
+        await here.says("the odometry jumped to its origin")
         assert here.error(pose)[0] < 0.4
         assert here.error(await here.drive(8))[0] < 0.15
 
