@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 
 ODOMETRY_TIMEOUT = 0.5
 """Odometry older than this does not tell the robot's speeds any more, seconds."""
+AHEAD = 1.0
+"""A place by odometry that is dated this far into the future is not of now, seconds."""
+MAP_AHEAD = 5.0
+"""The same of the odometry's place on the map, which localization dates into the future on purpose."""
+FORGET_EVERY = 5.0
+"""Seconds between two times that transforms of the future are forgotten."""
 JUMP = 1.0
 """A robot that moves by more than this between two control steps has jumped, metres."""
 
@@ -80,7 +86,7 @@ class RobotPlace:
         self._throttled_log = throttled_log
         self._last: Pose | None = None
         self._twist = Twist()
-        self._moved_at = float("-inf")
+        self._moved_at = self._forgot_at = float("-inf")
 
     def take_odometry(self, message: Message) -> None:
         """Take the robot's speeds."""
@@ -104,12 +110,27 @@ class RobotPlace:
         except TransformError as error:
             return Place(nowhere, nowhere, f"waiting for transforms: {error}")
         now = self._node.time()
-        for one in (found, moved):
+        for one, ahead in ((found, AHEAD), (moved, MAP_AHEAD)):
             age = now - one.stamp.to_sec()
-            if one.stamp and age > self._tolerance and one.parent != one.child:
-                text = f"the transform from {one.child} to {one.parent} is {age:.2f} s old"
-                return Place(nowhere, nowhere, f"{text} (transform_tolerance {self._tolerance:.2f} s)")
+            if not one.stamp or one.parent == one.child or -ahead <= age <= self._tolerance:
+                continue
+            text = f"the transform from {one.child} to {one.parent} is"
+            if age > 0:
+                why = f"{text} {age:.2f} s old (transform_tolerance {self._tolerance:.2f} s)"
+            else:
+                why = f"{text} {-age:.2f} s in the future: are the clocks of the machines in step?"
+                self._forget_future(now)
+            return Place(nowhere, nowhere, why)
         pose = pose_of(found.transform)
         last, self._last = self._last, pose
         jumped = last is not None and hypot(pose.x - last.x, pose.y - last.y) > JUMP
         return Place(pose, pose_of(moved.transform), jumped=jumped)
+
+    def _forget_future(self, now: float) -> None:
+        """Forget transforms: while there are those of the future, none of now are taken.
+
+        A robot's clock was set back, perhaps, or a simulation began anew.
+        """
+        if not 0 <= now - self._forgot_at < FORGET_EVERY:
+            self._forgot_at = now
+            self._transforms.buffer.clear()
