@@ -10,6 +10,7 @@ import numpy as np
 from rce.ros.tf import Transform, Vector
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.scan import LaserScan
+from rce_fleet.navigation.scans import is_count_of
 from rce_fleet.nodes.planar import angles_from_above, pose_fields
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
 MAX_BEAMS = 100_000
-_SLACK = 2
-"""Beams that a scan may have more or fewer than its angles say: drivers round differently."""
 
 
 def metadata_fields(grid: OccupancyMap, loaded: Time) -> dict[str, Any]:
@@ -75,7 +74,7 @@ def read_scan(message: Message, base_from_laser: Transform) -> LaserScan:
         )
     count = len(message.ranges)
     expected = (message.angle_max - message.angle_min) / message.angle_increment + 1
-    if not 1 <= count <= MAX_BEAMS or abs(count - expected) > max(_SLACK, 0.02 * expected):
+    if not 1 <= count <= MAX_BEAMS or not is_count_of(count, expected):
         raise ValueError(f"it has {count} ranges; its angles are those of {expected:.0f}")
     forward = base_from_laser.rotation.rotate(Vector(x=1.0))
     angle_min, angle_increment = angles_from_above(

@@ -236,12 +236,14 @@ class MoveBaseNode:
 
     def _problem_of_costmaps(self, now: float) -> str:
         """Return why the robot must stand; empty if it may drive."""
-        for costmap in (self.stack.global_costmap, self.stack.local_costmap):
+        costmaps = (self.stack.global_costmap, self.stack.local_costmap)
+        for costmap, sources in zip(costmaps, self._sources, strict=True):
             if not costmap.is_ready:
                 assert costmap.static is not None
                 topic = self._node.resolve(costmap.static.parameters.map_topic)
                 return self._map_fault or f"waiting for the map on {topic}"
             late = costmap.obstacles.late_sources(now) if costmap.obstacles is not None else []
+            late += [name for name in sources.refused(now) if name not in late]
             if late:
                 faults = [text for one in self._sources for text in one.faults_of(late)]
                 why = f": {faults[0]}" if faults else ""

@@ -63,6 +63,8 @@ class ObservationSources:
         self._waiting: dict[str, deque[Message]] = {}
         self._faults: dict[str, str] = {}
         """What was wrong with the last message of a source."""
+        self._used_at: dict[str, float] = {}
+        """When a message of a source was used last, seconds."""
         self.newest: Time | None = None
 
     async def start(self) -> None:
@@ -93,6 +95,16 @@ class ObservationSources:
                     break
                 waiting.popleft()
 
+    def refused(self, now: float) -> list[str]:
+        """Return the sources whose last message was of no use, and all others lately too.
+
+        Args:
+            now: Seconds.
+        """
+        return [
+            name for name in self._faults if not 0 <= now - self._used_at.get(name, float("-inf")) <= OLDEST
+        ]
+
     def faults_of(self, names: Iterable[str]) -> list[str]:
         """Return what was wrong with the last messages of these sources."""
         return [self._faults[name] for name in names if name in self._faults]
@@ -112,6 +124,7 @@ class ObservationSources:
                 if self._costmap.obstacles is not None:
                     self._costmap.obstacles.take(name, seen)
                 self._faults.pop(name, None)
+                self._used_at[name] = now
                 if self.newest is None or stamp > self.newest:
                     self.newest = stamp
             except ExtrapolationError as error:

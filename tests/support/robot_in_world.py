@@ -12,6 +12,7 @@ import numpy as np
 
 from rce.ros.node import Node
 from rce.ros.tf import StampedTransform, Transform
+from rce.ros.types import Time
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.nodes.planar import pose_fields, read_twist, twist_fields
 from rce_fleet.simulation.lidar import LidarSpec
@@ -46,6 +47,7 @@ class RobotInWorld:
         senses: Whether scans are published.
         is_localized: Whether the odometry's place in the map is published.
         map_from_odom: The odometry's frame in the map.
+        lidar_clock: How far the lidar's clock is ahead, seconds.
     """
 
     def __init__(self, node: Node, walls: list[Rectangle], boxes: list[Rectangle], at: Pose) -> None:
@@ -57,6 +59,7 @@ class RobotInWorld:
         self.senses = True
         self.is_localized = True
         self.map_from_odom = Pose(0.4, -0.3, 0.2)
+        self.lidar_clock = 0.0
 
     async def run(self) -> None:
         """Let time pass until cancelled."""
@@ -105,7 +108,10 @@ class RobotInWorld:
             if self.senses and world.time - sensed >= SENSE_EVERY:
                 sensed = world.time
                 scan.publish(
-                    header={"stamp": stamp, "frame_id": "base_scan"},
+                    header={
+                        "stamp": Time.from_sec(stamp.to_sec() + self.lidar_clock),
+                        "frame_id": "base_scan",
+                    },
                     angle_min=-pi,
                     angle_max=pi - 2 * pi / BEAMS,
                     angle_increment=2 * pi / BEAMS,

@@ -257,3 +257,24 @@ async def test_without_its_localization_it_stands_and_claims_to_be_nowhere(core:
         places = [message.base_position.pose.position for message in feedback]
         assert len(places) > heard
         assert all(START.x - 0.1 < place.x < 3.4 and 0.7 < place.y < 1.3 for place in places)
+
+
+async def test_a_robot_whose_scans_are_refused_says_why(core: Core) -> None:
+    """It stands: its place is known, but the costmaps show only the map. Sources have no expected rate."""
+    async with navigation(core) as (judge, robot, base), client_of(judge) as client:
+        robot.lidar_clock = 30.0
+        reasons: list[str] = []
+
+        def take(message: Message) -> None:
+            reasons.extend(status.message for status in message.status if "move_base" in status.name)
+
+        await judge.subscribe("diagnostics", "diagnostic_msgs/DiagnosticArray", take)
+        async with asyncio.timeout(60):
+            while "are the clocks of the machines in step" not in "".join(reasons[-1:]):
+                await asyncio.sleep(0.05)
+        assert "no recent message of source scan: the last one is ignored: its stamp is" in reasons[-1]
+        goal = await client.send(goal_to(3.2, 1.0))
+        await asyncio.sleep(1.0)
+        assert base.commanded == Twist()
+        robot.lidar_clock = 0.0
+        await asyncio.wait_for(goal.result(), 120)
