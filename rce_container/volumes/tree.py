@@ -388,6 +388,8 @@ def _copy_file(access: _Access, path: bytes, made: Descent, allowance: Allowance
             found = os.fstat(source)
             size = found.st_size
             allowance.begin(size)
+            if os.fstat(fd).st_size > size:  # sharing blocks leaves what is behind them
+                os.ftruncate(fd, size)
             try:
                 fcntl.ioctl(fd, _CLONE, source)
             except OSError:  # another file system, or one that cannot share blocks
