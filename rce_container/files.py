@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import stat
 import subprocess
@@ -14,25 +15,41 @@ UNFINISHED = ".new"
 """Suffix of a file that is being written. One that is left is of a process that was killed meanwhile."""
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes, *, durable: bool = False) -> None:
     """Write a file atomically, through a file :data:`UNFINISHED` beside it.
 
     Args:
         path: The file.
         data: All of it.
+        durable: Whether it is on the disk when this returns; else it may be empty after a loss of power.
 
     Raises:
         OSError: It cannot be written; the error names a file. A former version stays.
     """
     temporary = path.with_name(f"{path.name}{UNFINISHED}")
     try:
-        temporary.write_bytes(data)
+        with temporary.open("wb") as file:
+            file.write(data)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.replace(path)
+        if durable:
+            sync_folder(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
         error.filename = error.filename or str(path)
         raise
+
+
+def sync_folder(folder: Path) -> None:
+    """Write to the disk which files a folder holds."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def size_of(folder: Path) -> int:

@@ -242,7 +242,7 @@ class StateFolder:
                 raise StateError(
                     f"{requested!r} cannot name a task set: use letters, digits, '_', '-' and '.'"
                 )
-            self._keep(self._state / "name", requested)
+            self._keep(self._state / "name", requested, durable=True)
         return self._word("name", f"container-{secrets.token_hex(4)}")
 
     @property
@@ -324,11 +324,11 @@ class StateFolder:
             word = ""
         if not _NAME.fullmatch(word):
             word = default
-            self._keep(path, word)
+            self._keep(path, word, durable=True)  # volumes belong to a task set of this name
         return word
 
-    def _keep(self, path: Path, word: str) -> None:
+    def _keep(self, path: Path, word: str, *, durable: bool = False) -> None:
         try:
-            write_whole(path, word.encode())
+            write_whole(path, word.encode(), durable=durable)
         except OSError as error:
             raise StateError(f"cannot write {path}: {error.strerror}") from error

@@ -17,7 +17,7 @@ from pathlib import Path
 from rce.model import is_name
 from rce_container.descent import FOLDER
 from rce_container.exceptions import VolumeError
-from rce_container.files import remove, write_whole
+from rce_container.files import remove, sync_folder, write_whole
 from rce_container.folder import make_accessible
 from rce_container.volumes import images
 from rce_container.volumes.mounted import open_image, open_inside
@@ -70,12 +70,13 @@ class VolumePlaces:
             self._folder.joinpath(*parts[:count]).mkdir(mode=0o700, exist_ok=True)
 
     def existing(self) -> list[str]:
-        """Return all volumes."""
-        try:
-            users = [user for user in self._folder.iterdir() if is_name(user.name)]
-            return sorted({f"{user.name}/{one.stem}" for user in users for one in user.iterdir()})
-        except OSError:
-            return []
+        """Return all volumes, without other files beside them, such as copies that an operator made."""
+        found = set[str]()
+        for user in _paths_in(self._folder):
+            if is_name(user.name):
+                names = (path.name.removesuffix(".img") for path in _paths_in(user))
+                found.update(f"{user.name}/{name}" for name in names if is_name(name))
+        return sorted(found)
 
     # One placement
 
@@ -192,15 +193,14 @@ class VolumePlaces:
         remove(self._scratch)
 
     def note_placement(self, id_: str, number: int) -> None:
-        """Note which placement a volume's files belong to. Blocks.
+        """Note which placement a volume's files belong to, so that it survives a loss of power. Blocks.
 
         Raises:
             OSError: It cannot be written.
         """
         marker = self._marker(id_)
         self.make_folder(marker.parent)
-        write_whole(marker, str(number).encode())
-        sync_folder(marker.parent)
+        write_whole(marker, str(number).encode(), durable=True)
 
     def exists(self, id_: str) -> bool:
         """Whether a volume has files here."""
@@ -240,10 +240,9 @@ class VolumePlaces:
                 remove(path)
 
 
-def sync_folder(folder: Path) -> None:
-    """Write to the disk which files a folder holds. Blocks."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+def _paths_in(folder: Path) -> list[Path]:
+    """List a folder; what is not a folder, or was removed meanwhile, counts as empty."""
     try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+        return list(folder.iterdir())
+    except OSError:
+        return []

@@ -261,8 +261,8 @@ class VolumeStore:
         return _too_full(claim.id, used, claim.size, fault) if fault or used > claim.size else ""
 
     def _measure(self, id_: str, pid: int, path: str) -> None:
-        place, image = self.places.folder(id_), self.places.image(id_)
         with contextlib.suppress(OSError, VolumeError):  # it was removed, or its container ended just now
+            place, image = self.places.folder(id_), self.places.image(id_)
             if place.is_dir():
                 self.used[id_], fault = measuring.measure(place)
                 self._faults[id_] = fault

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,20 @@ def test_the_name_is_kept(tmp_path: Path) -> None:
         assert state.name("") == "mine"
         with pytest.raises(StateError, match="cannot name a task set"):
             state.name("a b")
+
+
+def test_a_new_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a loss of power, a task set of another name would not have the volumes of this one."""
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.fstat(fd).st_ino))
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        for requested in ("", "mine"):
+            state.name(requested)
+            assert synced[-2:] == [
+                (tmp_path / "state" / "name").stat().st_ino,
+                (tmp_path / "state").stat().st_ino,
+            ]
+            synced.clear()
 
 
 def test_the_newest_term_is_kept(tmp_path: Path) -> None:

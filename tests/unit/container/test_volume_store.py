@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -65,3 +66,48 @@ def test_volumes_come_and_go_while_they_are_measured(tmp_path: Path) -> None:
     is_done.set()
     thread.join()
     assert faults == []
+
+
+def test_files_beside_volumes_are_passed_over(tmp_path: Path) -> None:
+    """Operators copy volumes to names beside them, and rsync writes to a hidden name first."""
+    store = VolumeStore(tmp_path, images=True)
+    (tmp_path / "anna" / "folder").mkdir(parents=True)
+    (tmp_path / "anna" / "folder" / "file").write_bytes(bytes(5))
+    (tmp_path / "notes").touch()  # the name of a user, but not a folder
+    for name in ("map.img", "map.img.bak", "map-old.img", ".map.img.aB3dEf", "words.txt"):
+        (tmp_path / "anna" / name).touch()
+    assert store.places.existing() == ["anna/folder", "anna/map"]
+    assert store.measure({}) == []
+    assert list(store.used) == ["anna/folder"], "map.img holds no file system"
+
+
+def test_an_invalid_name_does_not_end_the_measuring(tmp_path: Path) -> None:
+    store = VolumeStore(tmp_path, images=True)
+    store.hold("anna/map-old")
+    assert store.measure({}) == []
+
+
+def test_a_placement_is_on_the_disk_before_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a loss of power, an empty marker would say that the volume's files are lost."""
+    synced: list[int] = []
+    late: list[str] = []
+    sync, replace = os.fsync, Path.replace
+
+    def noted(fd: int) -> None:
+        synced.append(os.fstat(fd).st_ino)
+        sync(fd)
+
+    def checked(path: Path, target: Path) -> Path:
+        if path.stat().st_ino not in synced:
+            late.append(path.name)
+        synced.clear()
+        return replace(path, target)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(Path, "replace", checked)
+    places = VolumePlaces(tmp_path / "volumes", images=False)
+    places.make_folder(tmp_path / "volumes" / "anna" / "map")
+    places.note_placement("anna/map", 7)
+    assert places.placement("anna/map") == 7
+    assert late == []
+    assert synced == [(tmp_path / "volumes" / ".placements" / "anna").stat().st_ino]
