@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce.model import about
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import StateDir, choose, open_state
+from rce_master.cli.tables import TextTable
 from rce_master.exceptions import NotFoundError
 from rce_master.limit_values import read_limit
 from rce_master.state.commands import SetLimits
@@ -57,12 +57,12 @@ async def _show(name: str, place: Path | Credentials) -> None:
     Console().print(_table(user["limits"]))
 
 
-def _table(limits: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = Table("what", "used", "limit", "", box=None)
+def _table(limits: Mapping[str, Mapping[str, Any]]) -> TextTable:
+    table = TextTable("what", "used", "limit", "")
     for kind, limit in limits.items():
         most = _amount(kind, limit["limit"]) if limit["limit"] else "none"
         source = limit["source"]
-        table.add_row(kind, _amount(kind, limit["used"]), most, _SOURCES.get(source, source))
+        table.add(kind, _amount(kind, limit["used"]), most, _SOURCES.get(source, source))
     return table
 
 

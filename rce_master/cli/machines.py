@@ -8,13 +8,14 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
+from rich.text import Text
 
 from rce.model import about, write_cores
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, of_user, run
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.cli.show import console
+from rce_master.cli.tables import TextTable, coloured, plain
 
 POLL_S = 0.5
 LOST_POLLS = 60
@@ -43,7 +44,7 @@ async def _machines(as_json: bool) -> None:
         screen.print(overview_of_masters(masters))
     for machine in found:
         if machine["detail"]:
-            screen.print(f"{machine['process']}: {machine['detail']}", markup=False, highlight=False)
+            screen.print(plain(f"{machine['process']}: {machine['detail']}"))
         _print_staying(machine)
 
 
@@ -57,25 +58,24 @@ async def fetch_masters(client: ApiClient) -> list[Machine]:
         return []
 
 
-def overview_of_masters(found: list[Machine]) -> Table:
+def overview_of_masters(found: list[Machine]) -> TextTable:
     """Format several masters as a table."""
-    table = Table("master", "role", "url", box=None)
+    table = TextTable("master", "role", "url")
     for master in found:
-        away = master["role"] == "away"
-        state = f"[red]{master['role']}[/]" if away else master["role"]
-        table.add_row(
-            master["name"], state + (" [yellow]drained[/]" if master["drained"] else ""), master["url"]
-        )
+        state = coloured(master["role"])
+        if master["drained"]:
+            state.append(" drained", "yellow")
+        table.add(master["name"], state, master["url"])
     return table
 
 
-def overview(found: list[Machine]) -> Table:
+def overview(found: list[Machine]) -> TextTable:
     """Format machines as a table."""
     names = ("task set", "machine", "state", "containers", "slots", "cores", "memory")
-    table = Table(*names, "limits", "runtime", "labels", box=None)
+    table = TextTable(*names, "limits", "runtime", "labels")
     for machine in sorted(found, key=lambda m: (m["kind"], m["machine"], m["process"])):
         if machine["kind"] == "container":
-            table.add_row(
+            table.add(
                 machine["process"],
                 machine["machine"],
                 _state(machine),
@@ -89,7 +89,7 @@ def overview(found: list[Machine]) -> Table:
             )
         else:
             robots = f"{machine['endpoints']} robots"
-            table.add_row(machine["process"], machine["machine"], _state(machine), robots, *[""] * 6)
+            table.add(machine["process"], machine["machine"], _state(machine), robots, *[""] * 6)
     return table
 
 
@@ -97,10 +97,10 @@ def _of(promised: int, there: int) -> str:
     return f"{promised} of {there}" if there else str(promised)
 
 
-def _state(machine: Machine) -> str:
+def _state(machine: Machine) -> Text:
     if not machine["connected"]:
-        return "[red]away[/]"
-    return "[yellow]draining[/]" if machine["draining"] else "[green]connected[/]"
+        return coloured("away")
+    return coloured("draining" if machine["draining"] else "connected")
 
 
 def _print_staying(machine: Machine) -> None:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce.packages import BadArchiveError, SigningKey, key_id, statement
 from rce.packages.folder import Source, look_into
 from rce_master.cli import credentials, signing_key
 from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
 from rce_master.cli.exceptions import CliError
+from rce_master.cli.tables import TextTable
 
 if TYPE_CHECKING:
     from rce_master.cli.credentials import Credentials
@@ -114,10 +114,10 @@ def list_(user: OfUser = "") -> None:
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/packages", query=of_user(user))
-    table = Table("package", "version", "size", "pushed", "used by", box=None)
+    table = TextTable("package", "version", "size", "pushed", "used by")
     for one in found:
         version = one["version"] + (" (newest)" if one["newest"] else "")
-        table.add_row(_name(one, found), version, _bytes(one["packed"]), _when(one["created"]), _users(one))
+        table.add(_name(one, found), version, _bytes(one["packed"]), _when(one["created"]), _users(one))
     Console().print(table)
 
 
@@ -140,7 +140,7 @@ async def _show(name: str, version: str, user: str) -> None:
     if not fitting:
         raise CliError(f"there is no package {name!r}{f' of version {version!r}' if version else ''}")
     (one,) = fitting
-    table = Table(box=None, show_header=False)
+    table = TextTable(show_header=False)
     for key, value in (
         ("package", f"{one['name']}@{one['version']}" + (" (newest)" if one["newest"] else "")),
         ("description", one["description"] or "-"),
@@ -152,7 +152,7 @@ async def _show(name: str, version: str, user: str) -> None:
         ("pushed", _when(one["created"])),
         ("used by", _users(one)),
     ):
-        table.add_row(key, value)
+        table.add(key, value)
     Console().print(table)
 
 
@@ -183,10 +183,10 @@ async def _show_keys() -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/package-keys", "keys")
     own = signing_key.load()
-    table = Table("key", "label", "since", "", box=None)
+    table = TextTable("key", "label", "since", "")
     for one in found:
         here = "this machine's" if own is not None and own.public == one["key"] else ""
-        table.add_row(one["id"], one["label"] or "-", _when(one["created"]), here)
+        table.add(one["id"], one["label"] or "-", _when(one["created"]), here)
     Console().print(table)
     if own is not None and all(one["key"] != own.public for one in found):
         typer.echo(f"{signing_key.key_file()} ({key_id(own.public)}) is not registered")

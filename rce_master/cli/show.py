@@ -9,31 +9,14 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console, Group
-from rich.table import Table
 
 from rce.aio.tasks import errors_in
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError, CliError
+from rce_master.cli.tables import TextTable, coloured, yes_or_no
 
 _FORBIDDEN = 403
-_COLOURS = {
-    "running": "green",
-    "connected": "green",
-    "absent": "yellow",
-    "starting": "yellow",
-    "placed": "yellow",
-    "requested": "yellow",
-    "stopping": "yellow",
-    "waiting": "yellow",
-    "draining": "yellow",
-    "degraded": "yellow",
-    "stopped": "yellow",
-    "stuck": "red",
-    "failed": "red",
-    "lost": "red",
-    "away": "red",
-}
 
 Everything = dict[str, list[dict[str, Any]]]
 
@@ -88,22 +71,21 @@ async def _fetch(client: ApiClient, name: str) -> list[dict[str, Any]]:
 
 
 def _overview(found: Everything) -> Group:
-    robots = Table("robot", "state", "at", "interfaces", box=None)
+    robots = TextTable("robot", "state", "at", "interfaces")
     for robot in found["robots"]:
-        robots.add_row(robot["id"], coloured(robot["state"]), robot["task_set"], str(robot["interfaces"]))
-    containers = Table("container / node", "state", "at", "detail", box=None)
+        robots.add(robot["id"], coloured(robot["state"]), robot["task_set"], str(robot["interfaces"]))
+    containers = TextTable("container / node", "state", "at", "detail")
     for container in found["containers"]:
-        containers.add_row(
+        containers.add(
             container["id"], coloured(container["state"]), _place(container, found), container["detail"]
         )
         for node in found["nodes"]:
             if (node["user"], node["container"]) == (container["user"], container["tag"]):
                 what = f"{node['pkg']}/{node['exe']}"
-                containers.add_row(f"  {node['tag']}", coloured(node["state"]), what, node["detail"])
-    connections = Table("connection", "", "established", box=None)
+                containers.add(f"  {node['tag']}", coloured(node["state"]), what, node["detail"])
+    connections = TextTable("connection", "", "established")
     for connection in found["connections"]:
-        done = "[green]yes[/]" if connection["established"] else "[yellow]no[/]"
-        connections.add_row(connection["tag_a"], connection["tag_b"], done)
+        connections.add(connection["tag_a"], connection["tag_b"], yes_or_no(connection["established"]))
     return Group(robots, "", containers, "", connections)
 
 
@@ -114,8 +96,3 @@ def _place(container: dict[str, Any], found: Everything) -> str:
     if container["moving_to"]:
         return f"{place} -> {container['moving_to']}"
     return f"{place} (draining)" if container["task_set"] in draining else place
-
-
-def coloured(state: str) -> str:
-    """Return a state in a colour that shows its severity."""
-    return f"[{_COLOURS.get(state, 'default')}]{state}[/]"

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, OfUserByAdmin, of_user, run
 from rce_master.cli.exceptions import NotLoggedInError
+from rce_master.cli.tables import TextTable
 
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
 robots = typer.Typer(no_args_is_help=True, help="Add, list and revoke tokens of robots.")
@@ -97,9 +97,9 @@ def revoke_robots(
 async def _list(path: str, user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items(path, "tokens", of_user(user))
-    table = Table("id", "for", "label", "since", "expires", "last used", box=None)
+    table = TextTable("id", "for", "label", "since", "expires", "last used")
     for each in sorted(found, key=lambda one: float(one["created"])):
-        table.add_row(
+        table.add(
             each["id"],
             each["scope"] or ("this login" if each["current"] else "login"),
             each["label"],

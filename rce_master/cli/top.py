@@ -10,14 +10,14 @@ from typing import Annotated, Any
 import typer
 from rich.console import Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
 from rce.model import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.machines import fetch_masters, overview_of_masters
-from rce_master.cli.show import coloured, console, fetch
+from rce_master.cli.show import console, fetch
+from rce_master.cli.tables import TextTable, coloured, plain, yes_or_no
 
 _FULL, _BUSY = 0.9, 0.75
 
@@ -107,13 +107,11 @@ async def _masters_seen(client: ApiClient, usage: Usage) -> list[Usage]:
     return await fetch_masters(client) if usage["machines"] else []
 
 
-def _machines(machines: list[Usage]) -> Table:
-    table = Table(
-        "machine", "state", "containers", "slots", "cpu", "promised", "memory", "promised", box=None
-    )
+def _machines(machines: list[Usage]) -> TextTable:
+    table = TextTable("machine", "state", "containers", "slots", "cpu", "promised", "memory", "promised")
     for machine in sorted(machines, key=lambda m: (m["machine"], m["process"])):
         state = "draining" if machine["draining"] else "connected"
-        table.add_row(
+        table.add(
             f"{machine['machine']} ({machine['process']})",
             coloured(state if machine["connected"] else "away"),
             str(machine["containers"]),
@@ -126,7 +124,7 @@ def _machines(machines: list[Usage]) -> Table:
     return table
 
 
-def _containers(containers: list[Usage], look: Look) -> Table:
+def _containers(containers: list[Usage], look: Look) -> TextTable:
     names = (
         "container",
         "state",
@@ -140,10 +138,10 @@ def _containers(containers: list[Usage], look: Look) -> Table:
         "link in",
         "out",
     )
-    table = Table(*names, "procs", "restarts", "oom", box=None)
+    table = TextTable(*names, "procs", "restarts", "oom")
     for container in sorted(containers, key=lambda c: _rank(c, look.sort)):
-        table.add_row(
-            escape(container["id"]),
+        table.add(
+            container["id"],
             coloured(container["state"]),
             container["machine"],
             f"{100 * container['cpu']:.0f} %",
@@ -159,9 +157,15 @@ def _containers(containers: list[Usage], look: Look) -> Table:
             _count(container["oom_kills"]),
         )
         for node in container["nodes"] if look.nodes else ():
-            cells = [f"  {node['tag']}", coloured(node["state"]), "", f"{100 * node['cpu']:.0f} %", ""]
+            cells: list[str | Text] = [
+                f"  {node['tag']}",
+                coloured(node["state"]),
+                "",
+                f"{100 * node['cpu']:.0f} %",
+                "",
+            ]
             cells += [about(node["memory"]), *[""] * 5, str(node["processes"]), _count(node["restarts"])]
-            table.add_row(*cells)
+            table.add(*cells)
     return table
 
 
@@ -177,52 +181,52 @@ def _rank(container: Usage, order: Order) -> tuple[float, str]:
     return -amounts[order], container["id"]
 
 
-def _container_advice(containers: list[Usage], user: str) -> list[str]:
-    lines = []
+def _container_advice(containers: list[Usage], user: str) -> list[Text]:
+    lines = list[Text]()
     for container in containers:
         of = "" if container["user"] == user or not user else f" --user {container['user']}"
         lines += _advice([container], "id", of)
     return lines
 
 
-def _advice(items: list[Usage], key: str, more: str = "") -> list[str]:
-    lines = []
+def _advice(items: list[Usage], key: str, more: str = "") -> list[Text]:
+    lines = list[Text]()
     for item in items:
         for one in item["advice"]:
-            lines.append(f"[yellow]{escape(item[key])}[/] {one['about']}: {escape(one['text'])}")
-            lines.append(f"  [bold]{escape(one['command'])}{more}[/]")
+            lines.append(Text.assemble(plain(item[key], "yellow"), plain(f" {one['about']}: {one['text']}")))
+            lines.append(plain(f"  {one['command']}{more}", "bold"))
     return lines
 
 
-def _interfaces(now: list[Usage], before: list[Usage], interval: float) -> Table:
+def _interfaces(now: list[Usage], before: list[Usage], interval: float) -> TextTable:
     old = {(i["user"], i["endpoint"], i["tag"]): i for i in before}
-    table = Table("interface", "active", "in/s", "out/s", "dropped", box=None)
+    table = TextTable("interface", "active", "in/s", "out/s", "dropped")
     for interface in now:
         last = old.get((interface["user"], interface["endpoint"], interface["tag"]))
         rates = [
             "" if last is None else f"{max(0.0, (interface[key] - last[key]) / interval):.1f}"
             for key in ("messages_in", "messages_out")
         ]
-        table.add_row(
+        table.add(
             f"{interface['user']}/{interface['endpoint']}/{interface['tag']}",
-            "[green]yes[/]" if interface["active"] else "[yellow]no[/]",
+            yes_or_no(interface["active"]),
             *rates,
             str(interface["dropped"]),
         )
     return table
 
 
-def _share(used: float, there: float) -> str:
+def _share(used: float, there: float) -> Text:
     if not there:
-        return ""
+        return Text()
     share = used / there
     colour = "red" if share > _FULL else "yellow" if share > _BUSY else "default"
-    return f"[{colour}]{share:.0%}[/]"
+    return plain(f"{share:.0%}", colour)
 
 
 def _rate(count: float) -> str:
     return f"{about(count)}/s" if count else ""
 
 
-def _count(number: int) -> str:
-    return f"[red]{number}[/]" if number else ""
+def _count(number: int) -> Text:
+    return plain(str(number) if number else "", "red")

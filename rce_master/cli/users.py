@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce.config import EtcdAddress
 from rce_master.auth import Authenticator, client_digest
@@ -18,6 +17,7 @@ from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import OfflineState, StateDir, StoreOption, choose, open_state, read_etcd
 from rce_master.cli.session import read_password
+from rce_master.cli.tables import TextTable
 from rce_master.state import commands
 from rce_master.state.user_records import User, UserRole
 
@@ -68,9 +68,9 @@ def list_(state_dir: StateDir = None) -> None:
 async def _list(state_dir: Path | None) -> None:
     async with _directory(state_dir) as users:
         found = await users.list()
-    table = Table("user", "role", "since", box=None)
+    table = TextTable("user", "role", "since")
     for user in found:
-        table.add_row(user["name"], user["role"], time.strftime("%Y-%m-%d", time.localtime(user["created"])))
+        table.add(user["name"], user["role"], time.strftime("%Y-%m-%d", time.localtime(user["created"])))
     Console().print(table)
 
 

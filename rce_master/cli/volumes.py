@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
+from rce_master.cli.tables import TextTable
 
 app = typer.Typer(no_args_is_help=True, help="List and remove volumes of containers.")
 
@@ -26,11 +26,11 @@ async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/volumes", query=of_user(user))
     several = len({one["user"] for one in found}) > 1
-    table = Table("volume", "used", "size", "machine", "container", "path", "snapshot", box=None)
+    table = TextTable("volume", "used", "size", "machine", "container", "path", "snapshot")
     for one in found:
         name = f"{one['user']}/{one['name']}" if several else one["name"]
         used = "-" if one["used"] is None else about(one["used"])
-        table.add_row(name, used, about(one["size"]), *(_or_dash(one, *_PLACE)), _snapshot(one))
+        table.add(name, used, about(one["size"]), *(_or_dash(one, *_PLACE)), _snapshot(one))
     Console().print(table)
 
 
