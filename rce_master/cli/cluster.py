@@ -103,7 +103,7 @@ def join(
 ) -> None:
     """Let this machine join a cluster."""
     local = _Local.of(address, name, (client_port, peer_port), tls, state_dir, foreground, run_as)
-    run(_join(local, _endpoints(members)))
+    run(_join(local, members))
 
 
 @app.command("status")
@@ -338,7 +338,8 @@ async def _init(local: _Local) -> None:
     await local.start(steps)
 
 
-async def _join(local: _Local, endpoints: list[str]) -> None:
+async def _join(local: _Local, addresses: str) -> None:
+    endpoints = _endpoints(addresses)
     machine = local.machine
     begins = local.begins()
     if machine.tls:

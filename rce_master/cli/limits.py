@@ -22,7 +22,6 @@ from rce_master.state.limits import KINDS, limit_of, used_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce_master.cli.credentials import Credentials
     from rce_master.state.core import State
 
 _SOURCES = {
@@ -39,10 +38,11 @@ def show(
     name: Annotated[str, typer.Argument(help="Default: yourself.")] = "", state_dir: StateDir = None
 ) -> None:
     """Show a user, what they may have and what they have."""
-    run(_show(name, choose(state_dir)))
+    run(_show(name, state_dir))
 
 
-async def _show(name: str, place: Path | Credentials) -> None:
+async def _show(name: str, state_dir: Path | None) -> None:
+    place = choose(state_dir)
     if not isinstance(place, Path):
         async with ApiClient.of(place) as client:
             user = await client.call("GET", f"/users/{name or place.user}")
@@ -92,10 +92,11 @@ def limit(
     chosen = {kind: value for kind, value in given.items() if value is not None}
     if not chosen:
         raise typer.BadParameter("say what to change, such as --slots 16; see: rce user limit --help")
-    run(_limit(name, chosen, choose(state_dir)))
+    run(_limit(name, chosen, state_dir))
 
 
-async def _limit(name: str, limits: dict[str, str], place: Path | Credentials) -> None:
+async def _limit(name: str, limits: dict[str, str], state_dir: Path | None) -> None:
+    place = choose(state_dir)
     if not isinstance(place, Path):
         async with ApiClient.of(place) as client:
             user = await client.call("PATCH", f"/users/{name}/limits", limits)

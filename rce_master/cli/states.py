@@ -7,12 +7,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from rce.model import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, OfUser, OfUserByAdmin, of_user, run
-from rce_master.cli.exceptions import CliError
+from rce_master.cli.tables import TextTable
 
 app = typer.Typer(no_args_is_help=True, help="List and remove saved states of nodes.")
 
@@ -27,11 +26,11 @@ async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/states", query=of_user(user))
     several = len({one["user"] for one in found}) > 1
-    table = Table("node", "size", "saved", "at", box=None)
+    table = TextTable("node", "size", "saved", "at")
     for one in found:
         name = f"{one['container']}/{one['node']}"
         age = f"{max(0.0, time.time() - one['taken']):.0f} s ago"
-        table.add_row(
+        table.add(
             f"{one['user']}/{name}" if several else name, about(one["size"]), age, one["machine"] or "-"
         )
     Console().print(table)
@@ -46,7 +45,7 @@ def remove(
     """Remove the saved state of a node."""
     container, slash, tag = node.partition("/")
     if not slash or not container or not tag or "/" in tag:
-        raise CliError(f"{node!r} names no node: write CONTAINER/NODE")
+        raise typer.BadParameter(f"{node!r} names no node: write CONTAINER/NODE")
     if not yes:
         typer.confirm(f"Remove the saved state of {node}?", abort=True)
     run(_remove(container, tag, user))

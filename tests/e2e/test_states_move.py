@@ -250,7 +250,7 @@ async def check_commands(folder: Path, master: MasterProcess, cloud: Cloud) -> N
     assert "C/count" in listed
     assert "first" in listed
     assert "removed" in await rce(folder, "state", "remove", "C/count", "--yes")
-    assert "names no node" in await rce(folder, "state", "remove", "C", "--yes", code=1)
+    assert "names no node" in await rce(folder, "state", "remove", "C", "--yes", code=2)
     before = await cloud.count()
     await cloud.passes(before, "first")
 

@@ -8,7 +8,6 @@ from rce.config.settings import EngineSettings
 from rce.control.messages import MachineInfo
 from rce_master.cli import limits
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
-from rce_master.cli.offline import choose
 from rce_master.program import _settings
 
 if TYPE_CHECKING:
@@ -56,17 +55,17 @@ async def test_limits_out_of_the_box(
 
         monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "login.json"))
         save(Credentials(url=site.url, user="testUser", token=site.token, expires=1e12))
-        await limits._limit("anna", {"slots": "5", "memory": "2G", "disk": "0"}, choose(None))
-        await limits._show("anna", choose(None))
+        await limits._limit("anna", {"slots": "5", "memory": "2G", "disk": "0"}, None)
+        await limits._show("anna", None)
         told = [line.split() for line in capsys.readouterr().out.splitlines()]
         assert ["slots", "0", "5", "set", "for", "this", "user"] in told
         assert any(line[:1] == ["disk"] and "none" in line for line in told)
-        await limits._show("", choose(None))
+        await limits._show("", None)
         told = [line.split() for line in capsys.readouterr().out.splitlines()]
         assert ["slots", "31", "none", "administrators", "have", "none", "unless", "it", "is", "set"] in told
         assert any(line[:1] == ["packages"] and line[-3:] == ["for", "all", "users"] for line in told)
         reply = await site.api("POST", "/containers", {"tag": "a", "size": 6}, token=anna, status=409)
         assert "you may have 5;" in reply["error"]
-        await limits._limit("anna", {"slots": "default"}, choose(None))
+        await limits._limit("anna", {"slots": "default"}, None)
         shown = (await site.api("GET", "/users/anna", token=anna))["limits"]
         assert (shown["slots"]["limit"], shown["slots"]["source"]) == (30, "machines")
