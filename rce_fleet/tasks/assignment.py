@@ -11,6 +11,7 @@ import numpy as np
 from rce_fleet.limits import MOST_LATE, within
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, driven, effort_of, share_needed
 from rce_fleet.tasks.matching import cheapest_pairs
+from rce_fleet.tasks.travel import REFRESHED
 from rce_fleet.tasks.urgency import most_urgent_first
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ _SPARE_TASKS = 50
 _PRICED = 6_000
 """So many pairs of a task and a profile are looked at in a step, or one profile: each takes some twenty
 microseconds. Robots of the other profiles have their turn in the steps after it."""
+_FURTHER = 500
+"""So many pairs of these are looked at beyond the most urgent tasks, if robots get none of those."""
 _LEAST_ENERGY = 1e-3
 """Share of a battery; a robot with less energy is as dear as can be."""
 _ATTEMPTS = 4
@@ -100,6 +103,8 @@ class Assigner:
         self._levels = levels
         self._next_group = 0
         """Counts the groups of robots that had their turn."""
+        self._next_task = 0
+        """Counts the tasks beyond the most urgent ones that had their turn."""
 
     def urgency(self, task: Task, now: float, seconds: float = 0.0) -> float:
         """Return what it is worth to begin with a task now, in seconds of way.
@@ -159,6 +164,8 @@ class Assigner:
         """Return which robots begin with which tasks, with the smallest sum of costs.
 
         If the robots have very many profiles, some of them are looked at, and the next ones in the next call.
+        Robots that can do none of the most urgent tasks get one of some others; of the next ones in the next
+        call.
 
         Args:
             tasks: Tasks that can begin now.
@@ -172,10 +179,30 @@ class Assigner:
             return []
         robots = self._in_turn(robots, len(tasks))
         robots = sorted(robots, key=lambda robot: robot.cell)  # Distances are read in the order of cells.
-        groups = [
-            _Group(columns, [robots[column] for column in columns]) for columns in _columns_by_profile(robots)
-        ]
-        urgent = self._most_urgent(tasks, groups, now)
+        waiting = most_urgent_first(tasks, now, self._rules)
+        groups = _grouped(robots)
+        urgent, passed = _suitable(waiting, groups, _most_tasks(len(robots)))
+        chosen = self._match(urgent, robots, groups, now, chargers, avoided, begins)
+        busy = {choice.robot for choice in chosen}
+        left, rest = [robot for robot in robots if robot.id not in busy], waiting[passed:]
+        if not left or not rest:
+            self._next_task = 0
+            return chosen
+        groups = _grouped(left)
+        further, _ = _suitable(self._further(rest, groups), groups, _FURTHER)
+        return chosen + self._match(further, left, groups, now, chargers, avoided, begins)
+
+    def _match(
+        self,
+        urgent: Sequence[Task],
+        robots: Sequence[FreeRobot],
+        groups: Sequence[_Group],
+        now: float,
+        chargers: Sequence[int],
+        avoided: Collection[tuple[int, str]],
+        begins: Callable[[Task], float],
+    ) -> list[Choice]:
+        """Return which robots begin with which of some tasks; see :meth:`choose`."""
         for group in groups:
             self._price(urgent, group, now, chargers)
         costs, ways = _joined(groups, len(urgent), len(robots))
@@ -214,20 +241,19 @@ class Assigner:
             self._next_group = begin + number
         return chosen
 
-    def _most_urgent(self, tasks: Sequence[Task], groups: Sequence[_Group], now: float) -> list[Task]:
-        """Return the most urgent of the tasks that one of the robots may do."""
-        robots = sum(len(group.names) for group in groups)
-        most = _most_tasks(robots)
-        names = {name: group for group in groups for name in group.names}
-        urgent = []
-        for task in most_urgent_first(tasks, now, self._rules):
-            only = task.order.robot
-            able = ([names[only]] if only in names else []) if only else groups
-            if any(not misfit(task, only or group.names[0], group.profile) for group in able):
-                urgent.append(task)
-                if len(urgent) == most:
-                    break
-        return urgent
+    def _further(self, tasks: Sequence[Task], groups: Sequence[_Group]) -> list[Task]:
+        """Return those of some tasks whose turn it is, so many that they are looked at in a short time."""
+        begin = self._next_task % len(tasks)
+        zones, budget = groups[0].profile.zone_cost, REFRESHED
+        chosen = []
+        for task in tasks[begin : begin + max(1, _FURTHER // len(groups))]:
+            chosen.append(task)
+            cells = [cell for stop in task.order.stops for cell in stop.cells]
+            budget -= len(self._travel.missing(cells, zones))
+            if budget <= 0:  # each has to be measured
+                break
+        self._next_task = begin + len(chosen)
+        return chosen
 
     def _pairs(
         self,
@@ -404,6 +430,26 @@ def _most_tasks(robots: int) -> int:
     return max(2 * robots, robots + _SPARE_TASKS)
 
 
+def _suitable(tasks: Sequence[Task], groups: Sequence[_Group], most: int) -> tuple[list[Task], int]:
+    """Return the first ones of some tasks that one of the robots may do, and how many were looked at.
+
+    Args:
+        tasks: The tasks.
+        groups: The robots.
+        most: So many are returned at most.
+    """
+    names = {name: group for group in groups for name in group.names}
+    found = []
+    for passed, task in enumerate(tasks, 1):
+        only = task.order.robot
+        able = ([names[only]] if only in names else []) if only else groups
+        if any(not misfit(task, only or group.names[0], group.profile) for group in able):
+            found.append(task)
+            if len(found) == most:
+                return found, passed
+    return found, len(tasks)
+
+
 def _joined(
     groups: Sequence[_Group], tasks: int, robots: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -414,6 +460,11 @@ def _joined(
     for group in groups:
         costs[:, group.columns], ways[:, group.columns] = group.costs, group.ways
     return costs, ways
+
+
+def _grouped(robots: Sequence[FreeRobot]) -> list[_Group]:
+    by_profile = _columns_by_profile(robots)
+    return [_Group(columns, [robots[column] for column in columns]) for columns in by_profile]
 
 
 def _columns_by_profile(robots: Sequence[FreeRobot]) -> list[list[int]]:

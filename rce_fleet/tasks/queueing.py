@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 NEAREST = 8
 """So many robots are looked at for each task, those that could be there first."""
 MOST_QUEUES, MOST_TASKS = 32, 32
-"""So many queues, the shortest ones, and the most urgent tasks are looked at each time."""
+"""So many queues, the shortest ones, and so many tasks, the most urgent ones, are looked at each time."""
+MOST_SKIPPED = 32
+"""So many tasks that none of these robots can do are passed over each time; the next ones the next time."""
 
 
 @dataclass(slots=True)
@@ -58,6 +60,8 @@ class Queues:
         self._travel = travel
         self._length = length
         self._efforts: dict[tuple[int, int, int], Effort] = {}
+        self._next_task = 0
+        """Counts the tasks beyond the most urgent ones that had their turn."""
 
     def begin_step(self) -> None:
         """Forget how long tasks take: the map may be another one."""
@@ -76,8 +80,8 @@ class Queues:
         queues = [queue for queue in queues if len(queue.tasks) < self._length]
         queues = sorted(queues, key=lambda queue: (len(queue.tasks), queue.ready))[:MOST_QUEUES]
         room = sum(self._length - len(queue.tasks) for queue in queues)
-        waiting = list(tasks[: min(room, MOST_TASKS)])
-        nearest = {task.number: self._nearest_first(task, queues, avoided) for task in waiting}
+        nearest = self._suitable(tasks, queues, avoided, min(room, MOST_TASKS))
+        waiting = [task for task in tasks if task.number in nearest]
         places: dict[tuple[int, str], tuple[float, int]] = {}
         options = {task.number: self._options(task, nearest[task.number], places) for task in waiting}
         inserted = []
@@ -115,6 +119,32 @@ class Queues:
             took, cell = self._leg(each, cell, queue.profile)
             seconds += took
         return seconds + self._effort(task, cell, queue.profile).first / queue.profile.speed
+
+    def _suitable(
+        self,
+        tasks: Sequence[Task],
+        queues: Sequence[RobotQueue],
+        avoided: Collection[tuple[int, str]],
+        most: int,
+    ) -> dict[int, list[RobotQueue]]:
+        """Return, by the numbers of tasks that are looked at now, the queues of robots that can do them.
+
+        Args:
+            tasks: The most urgent first.
+            queues: The queues.
+            avoided: See :meth:`insert`.
+            most: So many tasks are returned at most.
+        """
+        found: dict[int, list[RobotQueue]] = {}
+        begin = self._next_task if MOST_TASKS < self._next_task < len(tasks) else MOST_TASKS
+        self._next_task = begin + MOST_SKIPPED
+        for task in (*tasks[:MOST_TASKS], *tasks[begin : self._next_task]):
+            if len(found) >= most:
+                self._next_task = 0
+                break
+            if nearest := self._nearest_first(task, queues, avoided):
+                found[task.number] = nearest
+        return found
 
     def _nearest_first(
         self, task: Task, queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]]

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
+from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, _Group
 from rce_fleet.tasks.energy import BatteryLevels
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.queueing import Queues, RobotQueue
+from rce_fleet.tasks.queueing import MOST_SKIPPED, MOST_TASKS, Queues, RobotQueue
 from rce_fleet.tasks.records import RobotProfile
 from rce_fleet.tasks.task import Task
 from rce_fleet.tasks.travel import TravelCosts
+
+AISLE = GridMap(1, 10)
+
+
+def go(number: int, cell: int) -> Task:
+    return Task(number, Order((Stop(Action.GO, (cell,)),)), "", "", float(number), 0.0)
+
+
+def walled() -> TravelCosts:
+    """Return distances in an aisle whose cells from 5 on are behind a wall."""
+    travel = TravelCosts()
+    travel.set_map(AISLE, frozenset({5}), {}, 0)
+    return travel
 
 
 def test_the_queue_with_the_earliest_end_gets_the_task() -> None:
@@ -68,3 +83,58 @@ def test_robots_with_profiles_of_their_own_have_their_turns() -> None:
             break
     assert len(robots) == 134, "some robots that can do tasks got none"
     assert turns > 2
+
+
+def test_tasks_behind_a_wall_leave_robots_to_others() -> None:
+    """Sixty older ones fill the list of the most urgent; they are done first when the wall is gone."""
+    travel = walled()
+    assigner = Assigner(travel, AssignmentRules(), BatteryLevels())
+    tasks = [*(go(number, 9) for number in range(60)), go(60, 1)]
+    robots = [FreeRobot("A", 0, RobotProfile(), None)]
+    assert [choice.task.number for choice in assigner.choose(tasks, robots, 100.0)] == [60]
+    travel.set_map(AISLE, frozenset(), {}, 1)
+    assert [choice.task.number for choice in assigner.choose(tasks, robots, 100.0)] == [0]
+
+
+def test_each_robot_gets_a_task_on_its_side_of_a_wall() -> None:
+    """Those of one side are all more urgent: the robot of the other side is not left out."""
+    assigner = Assigner(walled(), AssignmentRules(), BatteryLevels())
+    tasks = [*(go(number, 9) for number in range(60)), go(60, 1)]
+    robots = [FreeRobot("A", 0, RobotProfile(), None), FreeRobot("B", 8, RobotProfile(speed=0.5), None)]
+    chosen = {choice.robot: choice.task.number for choice in assigner.choose(tasks, robots, 100.0)}
+    assert chosen == {"A": 60, "B": 0}
+
+
+class CountedAssigner(Assigner):
+    """Counts the tasks whose costs are computed."""
+
+    priced = 0
+
+    def _price(self, tasks: Sequence[Task], group: _Group, now: float, chargers: Sequence[int]) -> None:
+        self.priced += len(tasks)
+        super()._price(tasks, group, now, chargers)
+
+
+def test_thousands_of_vain_tasks_are_passed_in_turns() -> None:
+    """Each call looks at some of them, and at the most urgent ones, which may have become possible."""
+    travel = walled()
+    assigner = CountedAssigner(travel, AssignmentRules(), BatteryLevels())
+    tasks = [*(go(number, 9) for number in range(3000)), go(3000, 1)]
+    robots = [FreeRobot("A", 0, RobotProfile(), None)]
+    chosen, calls = list[int](), 0
+    while not chosen and calls < 10:
+        calls += 1
+        chosen = [choice.task.number for choice in assigner.choose(tasks, robots, 5000.0)]
+    assert (chosen, calls) == ([3000], 6)
+    assert assigner.priced <= calls * 551
+    travel.set_map(AISLE, frozenset(), {}, 1)
+    assert [choice.task.number for choice in assigner.choose(tasks, robots, 5000.0)] == [0]
+
+
+def test_tasks_behind_a_wall_leave_queues_to_others() -> None:
+    """In some calls, if there are many of them."""
+    queues = Queues(walled())
+    tasks = [*(go(number, 9) for number in range(MOST_TASKS + 2 * MOST_SKIPPED)), go(500, 1), go(501, 2)]
+    inserted = [queues.insert(tasks, [RobotQueue("A", RobotProfile(), 0, 10.0)]) for _ in range(3)]
+    assert [len(found) for found in inserted] == [0, 0, 2]
+    assert {(task.number, robot) for task, robot in inserted[2]} == {(500, "A"), (501, "A")}
