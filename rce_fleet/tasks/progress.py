@@ -61,6 +61,8 @@ class TaskProgress:
         self.avoid: dict[tuple[int, str], float] = {}
         self.standing: dict[int, str] = {}
         self._taken: dict[int, str] = {}
+        self._silent_until = 0.0
+        """When the planner was silent last: until it is heard, what robots do is not known."""
         self._unknown_since: dict[str, float] = {}
         """Of robots with a task that the planner does not know."""
         self._retry_at: dict[int, float] = {}
@@ -94,6 +96,7 @@ class TaskProgress:
         self._nearest, self._short_of_energy = nearest, short_of_energy
         self._charger_users = charger_users
         self._elapsed = facts.elapsed
+        self._silent_until = self._silent_until if facts.is_live else now
         self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
         self._taken = self.targets()
         self.standing = self._standing(facts)
@@ -318,8 +321,9 @@ class TaskProgress:
     # Robots that cannot go on
 
     def _waited(self, task: Task, robot: RobotFacts, now: float) -> float:
-        """Return for how long a robot has tried in vain to come nearer to its stop."""
-        return now - max(robot.moved_at, task.changed_at, self._tried_since.get(task.number, 0.0))
+        """Return for how long a robot has tried in vain to come nearer to its stop, as far as is known."""
+        tried = self._tried_since.get(task.number, 0.0)
+        return now - max(robot.moved_at, task.changed_at, tried, self._silent_until)
 
     def _check_trouble(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
         waited = self._waited(task, robot, now)

@@ -190,3 +190,33 @@ def test_a_task_of_which_nothing_is_left_needs_no_planner(floor: Floor, state: T
         floor.book.cancel(task.id, floor.now)
     floor.run(40)
     assert floor.task(task).state is state
+
+
+@pytest.mark.parametrize(("is_shut", "still"), [(False, 110), (True, 15)])
+def test_a_silent_planner_costs_no_robot_its_task(floor: Floor, is_shut: bool, still: int) -> None:
+    """How long robots stand still counts from when the planner is heard again."""
+    floor.add("Robot1", 0)
+    floor.stuck = {"Robot1"}
+    task = floor.go(5)
+    floor.run(5)
+    if is_shut:
+        floor.facts.shut, floor.facts.map_revision = frozenset({5}), 1
+    floor.facts.is_live = False
+    floor.run(300)
+    assert floor.task(task).robot == "Robot1"
+    floor.facts.is_live = True
+    floor.run(still)
+    assert floor.task(task).robot == "Robot1"
+    floor.run(20)
+    assert any(event.name == "released" for event in floor.events)
+
+
+def test_a_silent_planner_raises_no_question(floor: Floor) -> None:
+    floor.add("Robot1", 0)
+    task = floor.deliver(1, 5)
+    floor.run(5)
+    floor.stuck = {"Robot1"}
+    floor.facts.is_live = False
+    floor.run(300)
+    assert (floor.task(task).is_loaded, floor.task(task).state) == (True, TaskState.RUNNING)
+    assert not any(event.name == "question" for event in floor.events)
