@@ -8,6 +8,7 @@ knows none of them, and gets the journal's.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.manager.mirror import Mirror
@@ -70,6 +71,8 @@ class PlannerSync:
         self._zones: Mirror[str, Zone] = Mirror()
         self._cells: Mirror[int, bool] = Mirror(CELLS_DELAY_S)
         self._run = PlannerRun()
+        self._unlisted: dict[int, float] = {}
+        """Until when the planner's list need not have cells that are blocked since a robot has left them."""
 
     def take_book(self, book: TaskBook) -> None:
         """Continue with another book, made from the journal again."""
@@ -98,6 +101,7 @@ class PlannerSync:
         self._cells.restart({**told, **waiting} if keeps else {})
         self._facts.requested = None if keeps else frozenset()  # a planner that begins has no requests
         self._run = run
+        self._unlisted.clear()
         self._note_run(now)
         if not is_other_floor:
             return ""
@@ -121,6 +125,7 @@ class PlannerSync:
         if not self._is_comparable():
             return
         self._note_run(now)  # again, if the journal could not be written
+        self._note_pending(now)
         for name, mode in self._modes.compare(*self._modes_of_both(), now).to_adopt.items():
             self._adopt_mode(name, mode or AUTOMATIC, now)
         for key, zone_seen in self._zones.compare(*self._zones_of_both(), now).to_adopt.items():
@@ -205,6 +210,16 @@ class PlannerSync:
             text = "the planner has another grid" if is_other_floor else "the planner began"
             self._book.emit(self._run, "planner", now, text=text)
 
+    def _note_pending(self, now: float) -> None:
+        """Note which cells the planner's list of blocked cells has later than its state."""
+        facts = self._facts
+        left = {
+            cell: min(until, now + CELLS_DELAY_S)
+            for cell, until in self._unlisted.items()
+            if until > now and cell in facts.shut
+        }
+        self._unlisted = {**left, **dict.fromkeys(facts.pending, inf)}
+
     def _modes_kept(self) -> dict[str, str]:
         entries = {name: entry.mode for name, entry in self._book.robots.items()}
         entries[FLEET] = self._book.fleet.mode
@@ -248,7 +263,8 @@ class PlannerSync:
     def _cells_of_both(self) -> tuple[dict[int, bool], dict[int, bool]]:
         kept = dict.fromkeys(self._book.blocked.cells, True)
         seen = dict.fromkeys(self._facts.requested or (), True)
-        waiting = {cell: True for cell in kept if cell in self._facts.pending}
+        unlisted = self._facts.pending.union(self._facts.shut.intersection(self._unlisted))
+        waiting = {cell: True for cell in kept if cell in unlisted}
         return kept, {**seen, **waiting}
 
     # What the book takes over

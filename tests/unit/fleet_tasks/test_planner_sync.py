@@ -8,7 +8,14 @@ from math import inf, pi
 import pytest
 
 from rce_fleet.manager.convert import show_profile
-from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.planner_sync import (
+    CELLS_DELAY_S,
+    BlockCell,
+    PlannerCall,
+    PlannerSync,
+    SetMode,
+    SetZone,
+)
 from rce_fleet.manager.zones import checked, read_zone, zone_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.book import TaskBook
@@ -250,6 +257,44 @@ def test_a_cell_that_is_still_occupied_is_blocked_once() -> None:
     both.step()
     both.facts.requested, both.facts.pending = frozenset(), frozenset({9})
     assert (both.step(), both.book.blocked.cells) == ([], (9,))
+
+
+@pytest.mark.parametrize("silent", [0.0, 60.0])
+def test_a_cell_stays_blocked_when_its_robot_leaves(silent: float) -> None:
+    """The planner's list has it seconds later than its state; the planner may be silent meanwhile."""
+    both = Both()
+    both.book.emit(both.book.blocked.changed({9: True}, unsent=True), "blocked", both.now)
+    both.sync.adopt(both.now)
+    for call in both.sync.calls(both.now):
+        both.sync.took(call, both.now, refused=False)
+    both.facts.pending = both.facts.shut = frozenset({9})
+    assert (both.step(CELLS_DELAY_S + 1), both.book.blocked.cells) == ([], (9,))
+    if silent:
+        both.facts.is_live = False
+        both.step(silent)
+        both.facts.is_live = True
+    both.facts.pending = frozenset()
+    for _ in range(4):
+        assert (both.step(0.5), both.book.blocked.cells) == ([], (9,))
+    both.facts.requested = frozenset({9})
+    assert (both.step(20.0), both.book.blocked.cells) == ([], (9,))
+    both.facts.requested = frozenset()
+    assert (both.step(), both.book.blocked.cells) == ([], ())
+
+
+@pytest.mark.parametrize("is_shut", [False, True])
+def test_a_cell_freed_when_its_robot_left_is_adopted(is_shut: bool) -> None:
+    """Also if sensors keep it blocked: the list does not have it in time."""
+    both = Both()
+    both.facts.requested = frozenset({9})
+    both.step()
+    both.facts.pending, both.facts.shut = frozenset({9}), frozenset({9})
+    both.step()
+    both.facts.requested = both.facts.pending = frozenset()
+    both.facts.shut = frozenset({9} if is_shut else ())
+    both.step(1.0)
+    assert both.book.blocked.cells == ((9,) if is_shut else ())
+    assert (both.step(CELLS_DELAY_S), both.book.blocked.cells) == ([], ())
 
 
 def test_another_grid_brings_the_planners_zones() -> None:
