@@ -10,13 +10,14 @@ import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from math import inf
-from typing import TYPE_CHECKING, Any, Protocol, assert_never
+from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import EventQuery, event_fields
 from rce_fleet.manager.clock import WallClock
-from rce_fleet.manager.goals import GoalKeeper
+from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.hand_goals import HandGoals
+from rce_fleet.manager.planner_link import carry_out
 from rce_fleet.manager.planner_sync import FLEET, BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from logging import Logger
 
     from rce_fleet.journal.journal import Journal
+    from rce_fleet.manager.planner_link import PlannerLink
     from rce_fleet.tasks.records import FleetEvent, PlannerRun, Zone
 
 KEEP_ENDED = 10_000
@@ -44,22 +46,6 @@ LEAD_S = 60.0
 """People are warned if the journal is so much ahead of the machine's clock, seconds."""
 CLOCK_STEP_S = 2.0
 """A smaller step of the clock is one as time servers make it, seconds."""
-
-
-class PlannerLink(Protocol):
-    """The planner's services. Each returns why it refused; empty: it did not."""
-
-    async def set_goal(self, robot: str, cell: int | None) -> str:
-        """Send a robot to a cell, or remove its goal."""
-
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        """Block or free a cell."""
-
-    async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
-        """Set who drives a robot, or the fleet's mode (robot empty)."""
-
-    async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
-        """Make or replace a zone; None: remove it."""
 
 
 class FleetManager:
@@ -242,13 +228,35 @@ class FleetManager:
         for call in self._sync.calls(self.clock()):
             if not self.facts.is_live:
                 break
-            self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
-            refusal = await self._call(call)
-            self._sync.took(call, self.clock(), refused=bool(refusal))
+            refusal = await self._tell(call)
             if refusal:
                 refusals[call] = refusal
                 self._log.warning("the planner refused %s: %s", call, refusal)
+                if isinstance(call, SetZone) and call.zone and not refusal.startswith(NO_ANSWER):
+                    before = self.facts.zones.get(call.id)
+                    self._sync.undo_zone(call.zone, before, self.clock(), refusal)
         return refusals
+
+    async def set_zone(self, zone: Zone, before: Zone | None) -> str:
+        """Send a zone of a request, which is in the journal, to the planner at once.
+
+        Args:
+            zone: The zone.
+            before: What it replaces; None: nothing.
+
+        Returns:
+            Why the planner refused, so that the zones are as they were before; empty: it did not, or gets the
+            zone when it is heard again.
+
+        Raises:
+            JournalError: The journal cannot be written.
+        """
+        refusal = await self._tell(SetZone(zone.id, zone)) if self.facts.is_live else ""
+        if not refusal or refusal.startswith(NO_ANSWER):
+            return ""
+        if self._sync.undo_zone(zone, before, self.clock(), refusal):
+            await self.commit()
+        return refusal
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         """Send a request to block or free a cell, which is in the journal, to the planner at once.
@@ -261,10 +269,7 @@ class FleetManager:
         if not self.facts.is_live:
             return ""
         call = BlockCell(cell, blocked)
-        self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
-        refusal = await self._call(call)
-        self._sync.took(call, self.clock(), refused=bool(refusal))
-        return refusal
+        return await self._tell(call)
 
     async def set_fleet_mode(self, mode: str, reason: str, user: str) -> str:
         """Keep the fleet's mode in the journal, then send it to the planner at once.
@@ -289,9 +294,7 @@ class FleetManager:
         if not self.facts.is_live:
             return ""
         call = SetMode(FLEET, mode, reason, user)
-        self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
-        refusal = await self._call(call)
-        self._sync.took(call, self.clock(), refused=bool(refusal))
+        refusal = await self._tell(call)
         if refusal and self.book.fleet == changed:
             back = replace(before, revision=changed.revision + 1)
             self.book.emit(back, "refused", self.clock(), text=f"the fleet stays {before.mode}: {refusal}")
@@ -341,16 +344,11 @@ class FleetManager:
                     "%s; modes, zones, cells and goals may be sent again after a restart", error
                 )
 
-    async def _call(self, call: PlannerCall) -> str:
-        match call:
-            case SetMode(robot, mode, reason, user):
-                return await self._planner.set_mode(robot, mode, reason, user)
-            case SetZone(name, zone):
-                return await self._planner.set_zone(name, zone, self.clock())
-            case BlockCell(cell, blocked):
-                return await self._planner.block_cell(cell, blocked=blocked)
-            case _:
-                assert_never(call)
+    async def _tell(self, call: PlannerCall) -> str:
+        self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
+        refusal = await carry_out(self._planner, call, self.clock())
+        self._sync.took(call, self.clock(), refused=bool(refusal))
+        return refusal
 
     # Journal
 

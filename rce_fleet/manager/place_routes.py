@@ -91,7 +91,7 @@ async def zone(call: Call) -> FleetAnswer:
 
 
 async def set_zone(call: Call) -> FleetAnswer:
-    """Make or replace a zone."""
+    """Make or replace a zone; if the planner refuses, the zones stay as they were."""
     model, name = call.model(ZoneRequest), call.names[0]
     book = call.manager.book
     known = book.zones.get(name)
@@ -112,7 +112,8 @@ async def set_zone(call: Call) -> FleetAnswer:
     made = checked(asked, book.grid, call.now)
     book.emit(made, "zone", call.now, user=call.request.user, text=f"zone {name}: {model.kind}")
     await call.manager.commit()
-    await call.manager.tell_planner()
+    if refusal := await call.manager.set_zone(made, known):
+        raise TaskRefusedError(refusal)
     return shown(_show_zone(made), 200 if known else 201, made.revision)
 
 

@@ -167,6 +167,23 @@ class PlannerSync:
         else:
             self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
 
+    def undo_zone(self, zone: Zone, before: Zone | None, now: float, refusal: str) -> bool:
+        """Take back a zone that a request made, and that the planner refused; return whether it was there.
+
+        Args:
+            zone: The zone.
+            before: What it replaced; None: nothing.
+            now: Seconds since 1970.
+            refusal: Why the planner refused it.
+        """
+        known = self._book.zones.get(zone.id)
+        if known is None or not known.unsent or known.revision != zone.revision:
+            return False
+        back = replace(known, is_removed=True, unsent=False) if before is None else before
+        text = f"zone {zone.id} is as it was before: {refusal}"
+        self._book.emit(replace(back, revision=known.revision + 1), "refused", now, text=text)
+        return True
+
     def confirmed(self) -> list[RobotEntry | FleetEntry | Zone | BlockedCells]:
         """Return records whose change by a request the planner has now, marked so."""
         if not self._is_comparable():

@@ -16,7 +16,7 @@ from math import isfinite, pi, tau
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import TaskRefusedError
-from rce_fleet.limits import MOST_REASON, MOST_TIME, within
+from rce_fleet.limits import MOST_LIFETIME, MOST_REASON, MOST_TIME, within
 from rce_fleet.tasks.clamping import ZONE_VALUES
 from rce_fleet.tasks.records import Zone
 
@@ -84,7 +84,7 @@ def zone_fields(zone: Zone, now: float) -> dict[str, Any]:
         "cost": value if zone.kind == "cost" else 0.0,
         "reason": zone.reason,
         "by": zone.user,
-        "lifetime": 0.0 if zone.until is None else max(zone.until - now, 0.001),
+        "lifetime": 0.0 if zone.until is None else within(zone.until - now, 0.001, MOST_LIFETIME),
     }
 
 

@@ -311,3 +311,62 @@ async def test_a_cell_that_the_planner_refuses_stays(client: ManagerClient) -> N
     client.manager.facts.is_live = False
     assert (await client.ask("PUT", "/cells/12", {"blocked": True}))[0] == 200
     assert client.manager.book.blocked == BlockedCells((12,), (12,))
+
+
+async def test_a_zone_that_the_planner_refuses_is_not_made(client: ManagerClient) -> None:
+    """A changed one is as it was before; the answer says why."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    cost = {"kind": "cost", "cells": [6], "value": 2.0}
+    assert (await client.ask("PUT", "/zones/kept", cost))[0] == 201
+    manager.facts.zones["kept"] = kept = manager.book.zones["kept"]
+    planner.refusal = "zone: not on the map"
+    for name in ("new", "kept"):
+        status, said, _ = await client.ask("PUT", f"/zones/{name}", {**cost, "cells": [7]})
+        assert (status, said) == (409, {"error": "zone: not on the map"})
+    assert [zone["id"] for zone in (await client.ask("GET", "/zones"))[1]["zones"]] == ["kept"]
+    assert manager.book.zones["kept"].cells == kept.cells
+    assert manager.book.zones["kept"].revision > kept.revision + 1
+    planner.calls.clear()
+    planner.refusal = ""
+    for _ in range(2):
+        manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+        await manager.step()
+    assert planner.calls == []
+    assert (await client.ask("PUT", "/zones/new", cost))[0] == 201
+
+
+async def test_a_zone_off_a_map_not_known_yet_is_undone(client: ManagerClient) -> None:
+    """The planner was not heard yet when it was accepted; an event says why it is not there."""
+    manager, planner = client.manager, client.planner
+    manager.facts.grid = manager.book.grid = None
+    manager.facts.is_live = False
+    cost = {"kind": "cost", "cells": [6], "value": 2.0}
+    assert (await client.ask("PUT", "/zones/far", {**cost, "cells": [5000]}))[0] == 201
+    manager.facts.grid, manager.facts.is_live, manager.facts.is_current = GridMap(), True, True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    planner.refusal = "zone: cells [5000] are not on the map"
+    for _ in range(2):
+        await manager.step()
+    assert (await client.ask("GET", "/zones"))[1]["zones"] == []
+    events = (await client.ask("GET", "/events?id=far"))[1]["events"]
+    assert [event["name"] for event in events] == ["zone", "refused"]
+    assert planner.refusal in events[-1]["text"]
+    assert not [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+
+
+async def test_a_confirmed_zone_refused_later_stays(client: ManagerClient) -> None:
+    """A planner of an earlier release may not know its kind."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    await client.ask("PUT", "/zones/dear", {"kind": "cost", "cells": [6], "value": 2.0})
+    manager.facts.zones |= manager.book.zones
+    await manager.step()
+    manager.facts.zones.clear()
+    planner.refusal = "zone: kind must be one of blocked, slow"
+    manager.planner_began(PlannerRun("2", "8 x 8"))
+    await manager.step()
+    assert planner.calls[-1] == ("zone", "dear", "cost")
+    assert set(manager.book.zones) == {"dear"}

@@ -159,10 +159,11 @@ async def test_a_journal_that_cannot_be_read_is_read_later(
 
 async def test_a_restarted_manager_knows_everything(tmp_path: Path) -> None:
     first = ManagerClient(tmp_path / "j.sqlite")
+    facts = first.manager.facts
+    facts.is_live = False
     await first.ask("POST", "/tasks", GO, key="order-1")
     await first.ask("PUT", "/zones/ice", {"kind": "slow", "cells": [3], "value": 0.2})
-    facts = first.manager.facts
-    facts.is_current = True
+    facts.is_live = facts.is_current = True
     first.manager.planner_began(PlannerRun("1", "8 x 8"))
     facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
     facts.requested = frozenset({7})

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import inf, pi
+from types import SimpleNamespace
 
 import pytest
 
+from rce_fleet.limits import MOST_LIFETIME
 from rce_fleet.manager.convert import show_profile
 from rce_fleet.manager.planner_sync import (
     CELLS_DELAY_S,
@@ -17,6 +19,7 @@ from rce_fleet.manager.planner_sync import (
     SetZone,
 )
 from rce_fleet.manager.zones import checked, read_zone, zone_fields
+from rce_fleet.nodes.zone_messages import read_zone as read_by_planner
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.energy import effort_of
@@ -409,6 +412,13 @@ def test_a_floor_of_an_earlier_release_is_the_same_turned_or_not() -> None:
     assert not run.has_other_floor(PlannerRun())
     assert run.has_other_floor(PlannerRun("1.0", "8 x 8 cells of 1 m at (1.0, 0.0), 0 rad"))
     assert run.has_other_floor(PlannerRun("1.0", run.floor.replace("0.3", "1.2")))
+
+
+def test_the_planner_takes_zones_that_end_very_late() -> None:
+    """The API allows an end in the year 5138; the planner ends the zone after its longest life."""
+    zone = replace(SPILL, until=1e11)
+    taken = read_by_planner(SimpleNamespace(**zone_fields(zone, 1000.0)), 50.0)  # type: ignore[arg-type]
+    assert taken.expires == 50.0 + MOST_LIFETIME
 
 
 def test_a_zone_of_the_planner_has_the_limits_of_the_api() -> None:
