@@ -36,7 +36,7 @@ def issue(
     host: Annotated[
         list[str] | None,
         typer.Option(
-            help="Host name or IP address in the certificate; may be repeated [as before, or NAME]."
+            help="Host name or IP address in the certificate; may be repeated (default: as before, or NAME)."
         ),
     ] = None,
     certificates: Certificates = None,

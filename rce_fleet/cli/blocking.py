@@ -29,7 +29,7 @@ Places = Annotated[
 ]
 Lanes = Annotated[list[str] | None, typer.Option("--lane", help="A lane, by its name; may be repeated.")]
 Robots = Annotated[
-    list[str] | None, typer.Option("--robot", help="A robot that it is for [all]; may be repeated.")
+    list[str] | None, typer.Option("--robot", help="A robot that it is for (default: all); may be repeated.")
 ]
 
 

@@ -137,7 +137,7 @@ app.command("free")(blocking.free)
 @app.command("watch")
 def watch(
     after: Annotated[
-        int | None, typer.Option(help="Begin after the event of this number [the newest].")
+        int | None, typer.Option(help="Begin after the event of this number (default: the newest).")
     ] = None,
     json_: AsJsonLines = False,
     station: Station = STATION,

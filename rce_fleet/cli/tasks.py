@@ -81,7 +81,7 @@ def add(
         float | None, typer.Option(help="Seconds from one occurrence to the next: the task recurs.")
     ] = None,
     count: Annotated[
-        int | None, typer.Option(help="Occurrences in all, with --every [until it is cancelled].")
+        int | None, typer.Option(help="Occurrences in all, with --every (default: until cancelled).")
     ] = None,
     name: Annotated[str, typer.Option(help="For people.")] = "",
     key: Annotated[str, typer.Option(help="Your own key: the same key makes one task only.")] = "",

@@ -58,7 +58,7 @@ def add(
         typer.Option(help="A move that a blocked zone does not allow, such as 12>13; may be repeated."),
     ] = None,
     robot: Annotated[
-        list[str] | None, typer.Option(help="A robot that it is for [all]; may be repeated.")
+        list[str] | None, typer.Option(help="A robot that it is for (default: all); may be repeated.")
     ] = None,
     reason: Annotated[str, typer.Option(help="For people.")] = "",
     lasts: Annotated[float, typer.Option("--for", help="Seconds until it ends; 0: it stays.", min=0.0)] = 0.0,

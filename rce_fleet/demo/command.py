@@ -81,13 +81,14 @@ def demo(
         ),
     ] = None,
     world: Annotated[
-        str, typer.Option(metavar="NAME|FILE", help="Floor or warehouse, or a map (MovingAI .map) [floor].")
+        str,
+        typer.Option(metavar="NAME|FILE", help="Floor or warehouse, or a map of MovingAI (default: floor)."),
     ] = "",
     full_stack: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="Number of robots with AMCL and move_base; others are light [all; 0 above 20 robots].",
+            help="Number of robots with AMCL and move_base; others are light (all; 0 above 20 robots).",
         ),
     ] = None,
     robots_per_container: Annotated[

@@ -55,12 +55,12 @@ app = typer.Typer(no_args_is_help=True, help="Run masters on three machines (doc
 Address = Annotated[
     str, typer.Option(metavar="HOST", help="Address of this machine that the other machines reach.")
 ]
-Name = Annotated[str, typer.Option(help="Name of this machine in the cluster [its host name].")]
+Name = Annotated[str, typer.Option(help="Name of this machine in the cluster (default: its host name).")]
 ClientPort = Annotated[int, typer.Option(min=1, max=65535, help="Port of etcd for masters.")]
 PeerPort = Annotated[int, typer.Option(min=1, max=65535, help="Port of etcd for other members.")]
 StateDir = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Folder of data and certificates [root: /var/lib/rce]."),
+    typer.Option(metavar="DIR", help="Folder of data and certificates (of root: /var/lib/rce)."),
 ]
 UseTls = Annotated[bool, typer.Option("--tls/--no-tls", help="Use TLS between machines.")]
 Foreground = Annotated[
@@ -68,7 +68,10 @@ Foreground = Annotated[
 ]
 RunAs = Annotated[str, typer.Option(help="User of the services of the machine; created if missing.")]
 Etcd = Annotated[
-    str, typer.Option(metavar="HOST[:PORT],...", help="Members of etcd [those of this machine's cluster].")
+    str,
+    typer.Option(
+        metavar="HOST[:PORT],...", help="Members of etcd (default: those of this machine's cluster)."
+    ),
 ]
 
 

@@ -56,7 +56,7 @@ def _execute(
     ] = None,
     tty: Annotated[
         bool | None,
-        typer.Option("--tty/--no-tty", "-t/-T", help="Give it a terminal [if this is one]."),
+        typer.Option("--tty/--no-tty", "-t/-T", help="Give it a terminal (default: if this is one)."),
     ] = None,
     stdin: Annotated[bool, typer.Option("--stdin/--no-stdin", help="Pass standard input on.")] = True,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",

@@ -124,7 +124,7 @@ async def _list(user: str) -> None:
 @app.command("show")
 def show(
     name: Annotated[str, typer.Argument(help="Name of the package.")],
-    version: Annotated[str, typer.Argument(help="[the newest]", show_default=False)] = "",
+    version: Annotated[str, typer.Argument(help="(default: the newest)", show_default=False)] = "",
     user: OfUser = "",
 ) -> None:
     """Show a package."""
@@ -194,7 +194,7 @@ async def _show_keys() -> None:
 
 @keys.command("register")
 def register_key(
-    label: Annotated[str, typer.Option(help="To tell keys apart [this machine's name].")] = "",
+    label: Annotated[str, typer.Option(help="To tell keys apart (default: this machine's name).")] = "",
 ) -> None:
     """Let the engine take packages that this machine signs; its key is made if there is none."""
     run(_register_key(label))
