@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import json
 import os
 import pwd
@@ -95,6 +96,7 @@ def install(service: Service, *, start: bool = True) -> None:
     if service.user:
         make_user(service.user)
         _open_state_folder(service)
+        _open_secret(service)
     folder = _units(system=service.system)
     folder.mkdir(parents=True, exist_ok=True)
     path, text = folder / service.name, unit(service)
@@ -120,6 +122,49 @@ def _open_state_folder(service: Service) -> None:
     mode = stat.S_IMODE(SYSTEM_STATE.stat().st_mode)
     if not mode & stat.S_IXOTH:
         SYSTEM_STATE.chmod(mode | stat.S_IXGRP | stat.S_IXOTH)
+
+
+def _open_secret(service: Service) -> None:
+    """Let the service's user read the secret by its group, and not write it: the file stays root's."""
+    if service.secret is None:
+        return
+    _let_group(service.secret, service.user, stat.S_IROTH)
+    if service.secret.parent == SYSTEM_CONFIG:
+        _let_group(SYSTEM_CONFIG, service.user, stat.S_IXOTH)
+
+
+def _let_group(path: Path, user: str, bit: int) -> None:
+    """Let a user's group use a file as ``bit`` would let all users.
+
+    Raises:
+        typer.Exit: Other users would be let too, or shut out.
+    """
+    found = path.stat()
+    if _allows(found, user, bit):
+        return
+    group = grp.getgrgid(pwd.getpwnam(user).pw_gid)
+    members = {*group.gr_mem, *(each.pw_name for each in pwd.getpwall() if each.pw_gid == group.gr_gid)}
+    if others := sorted(members - {user}):
+        _fail(
+            f"user {user} may not read {path}; its group {group.gr_name} is not given access, since"
+            f" {others[0]} is in it too: give --run-as a user that has a group of its own"
+        )
+    if found.st_gid not in (0, group.gr_gid) and found.st_mode & bit << 3:
+        _fail(f"user {user} may not read {path}: add it to the group of this file, which others may use")
+    os.chown(path, -1, group.gr_gid)
+    path.chmod(stat.S_IMODE(found.st_mode) | bit << 3)
+
+
+def _allows(found: os.stat_result, user: str, bit: int) -> bool:
+    """Return whether a user may do with a file what ``bit`` lets all users do."""
+    try:
+        account = pwd.getpwnam(user)
+    except KeyError:  # it is created later
+        return bool(found.st_mode & bit)
+    if found.st_uid == account.pw_uid:
+        return bool(found.st_mode & bit << 6)
+    in_group = found.st_gid in os.getgrouplist(user, account.pw_gid)
+    return bool(found.st_mode & (bit << 3 if in_group else bit))
 
 
 def _is_active(service: Service) -> bool:
@@ -160,15 +205,17 @@ def make_service(
         Role.CONTAINER: settings.container_state,
     }
     user = run_as if system and role in (Role.MASTER, Role.ROBOT) and run_as != "root" else ""
+    secret = (settings.secret_file or SYSTEM_CONFIG / "secret") if system and not settings.dev else None
+    needed = (*_needed(program), *((secret,) if secret is not None else ()))
     return Service(
         role=role,
         program=program,
         arguments=(*words, *arguments),
         system=system,
         user=user,
-        secret=(settings.secret_file or SYSTEM_CONFIG / "secret") if system and not settings.dev else None,
+        secret=secret,
         state=states.get(role),
-        hide_homes=not any(path.is_relative_to(home) for path in _needed(program) for home in HOMES),
+        hide_homes=not any(path.is_relative_to(home) for path in needed for home in HOMES),
     )
 
 
@@ -215,13 +262,33 @@ def check(service: Service) -> None:
             " every user may, with a Python that is there too (/usr/bin/python3 -m venv /opt/rce), or give"
             " --run-as root"
         )
-    if service.secret is not None and not service.secret.exists():
-        _fail(
-            f"the secret {service.secret} is missing: create it with `rce secret new {service.secret}`,"
-            " or copy it from the master"
-        )
+    if service.secret is not None:
+        _check_secret(service, service.secret, hidden=hidden)
     if not service.system and not default_secret_file().exists():
         typer.echo(f"note: {default_secret_file()} has no secret yet; create one with: rce secret new")
+
+
+def _check_secret(service: Service, secret: Path, *, hidden: bool) -> None:
+    if not secret.exists():
+        _fail(
+            f"the secret {secret} is missing: create it with `rce secret new {secret}`,"
+            " or copy it from the master"
+        )
+    if hidden and any(secret.is_relative_to(folder) for folder in TEMPORARY):
+        _fail(
+            f"services have a /tmp and a /var/tmp of their own, so they do not see the secret {secret}:"
+            f" move it to {SYSTEM_CONFIG}"
+        )
+    # The folder of settings is opened when the service is installed.
+    path = SYSTEM_CONFIG if secret.parent == SYSTEM_CONFIG else secret
+    closed = next(
+        (each for each in path.parents if not _allows(each.stat(), service.user, stat.S_IXOTH)), None
+    )
+    if service.user and closed is not None:
+        _fail(
+            f"user {service.user} may not enter {closed}, which the secret {secret} is in: move it to"
+            f" {SYSTEM_CONFIG}, or give --run-as root"
+        )
 
 
 def _check_etcd(service: Service) -> None:
@@ -247,7 +314,15 @@ def make_user(name: str) -> None:
     try:
         pwd.getpwnam(name)
     except KeyError:
-        argv = ["useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", name]
+        argv = [
+            "useradd",
+            "--system",
+            "--user-group",
+            "--no-create-home",
+            "--shell",
+            "/usr/sbin/nologin",
+            name,
+        ]
         done = subprocess.run(argv, check=False, capture_output=True, text=True)  # noqa: S603 - fixed words
         if done.returncode:
             _fail(f"cannot create the user {name}: {done.stderr.strip()}")

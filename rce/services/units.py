@@ -11,7 +11,6 @@ from enum import StrEnum
 from pathlib import Path
 
 SYSTEM_STATE = Path("/var/lib/rce")
-_CREDENTIAL = "secret"
 
 
 class Role(StrEnum):
@@ -36,7 +35,7 @@ class Service:
         arguments: Its command line, without the program.
         system: A unit of the machine; else one of a user.
         user: The user that it runs as; empty for root, or the user whose unit it is.
-        secret: File with the engine's secret, handed over as a credential; None: the program finds it itself.
+        secret: File with the engine's secret; None: the program finds it itself.
         state: Folder that it may write; None for none.
         hide_homes: Hide home folders: it needs nothing in them.
     """
@@ -97,8 +96,9 @@ ProtectKernelModules=yes
 
 def unit(service: Service) -> str:
     """Return the text of a service's unit."""
-    bare = " ".join(map(quoted, (str(service.program), *service.arguments)))
-    command = bare if service.secret is None else f"{bare} --secret-file %d/{_CREDENTIAL}"
+    # The file itself, and not a credential of systemd: that is copied once, and the secret may change.
+    secret = () if service.secret is None else ("--secret-file", str(service.secret))
+    command = " ".join(map(quoted, (str(service.program), *service.arguments, *secret)))
     wanted_by = "multi-user.target" if service.system else "default.target"
     parts = [
         f"# Made by `rce install-service {service.role}`.\n",
@@ -107,7 +107,7 @@ def unit(service: Service) -> str:
         # At the end of the machine, the master hands over before its etcd stops.
         f"After=rce-{Role.ETCD}.service\n" if service.role is Role.MASTER else "",
         f"\n[Service]\nType=exec\nExecStart={command}\n",
-        _reload(service, bare) if service.role is Role.CONTAINER else "",
+        _reload(command) if service.role is Role.CONTAINER else "",
         "Environment=PYTHONUNBUFFERED=1\nRestart=always\nRestartSec=2\nTimeoutStopSec=60\nKillMode=mixed\n",
         f"SyslogIdentifier=rce-{service.role}\n",
         "LimitNOFILE=524288\n" if service.system else "",
@@ -117,10 +117,8 @@ def unit(service: Service) -> str:
     return "".join(parts)
 
 
-def _reload(service: Service, command: str) -> str:
+def _reload(command: str) -> str:
     """Return the lines for restarting the program in its own process, while its containers keep running."""
-    if service.secret is not None:  # systemd 252 hands credentials to the main process only
-        command += f" --secret-file {quoted(str(service.secret))}"
     return f"ExecReload={command} --check\nExecReload=/bin/kill -USR1 $MAINPID\n"
 
 
@@ -136,8 +134,6 @@ def quoted(text: str) -> str:
 def _place(service: Service) -> list[str]:
     """Return the lines on the unit's user and on the folders that it may access."""
     lines = [f"User={service.user}\n"] if service.user else []
-    if service.secret is not None:
-        lines.append(f"LoadCredential={_CREDENTIAL}:{service.secret}\n")
     holds_containers = service.role in (Role.CONTAINER, Role.ENGINE)
     if service.system:
         run = f"rce-{service.role}"

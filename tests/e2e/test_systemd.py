@@ -35,9 +35,7 @@ NODE = {"tag": "echo", "pkg": "Test", "exe": "stringEcho.py", "name": "echo"}
 
 
 async def install(machine: Booted) -> None:
-    machine.run(
-        f"mkdir /etc/rce; cat >/etc/rce/engine.yaml; {BIN}/rce secret new /etc/rce/secret", stdin=SETTINGS
-    )
+    machine.run(f"{BIN}/rce secret new /etc/rce/secret; cat >/etc/rce/engine.yaml", stdin=SETTINGS)
     machine.let_enter(sys.base_prefix, str(BIN))
     machine.run(
         f"{BIN}/rce user add alice --admin --password-stdin --state-dir /var/lib/rce/master",
@@ -98,6 +96,8 @@ async def test_services_survive_kills_and_reloads_and_stop_whole() -> None:
         assert "/rce-container.service/" in machine.run(f"cat /proc/{node}/cgroup"), "it has no cgroup"
         await asyncio.gather(check_restart(machine, "rce-master"), check_restart(machine, "rce-robot"))
         assert await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="the master knows") == node
+        await check_new_secret(machine)
+        assert await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="the node is known") == node
         await check_reload(machine)
         assert await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="it is adopted") == node
         machine.run("kill -KILL $(systemctl show --value -p MainPID rce-container)")
@@ -114,6 +114,47 @@ async def check_restart(machine: Booted, unit: str) -> None:
     await until(
         lambda: machine.journal(unit).count(" ready: ") > before, timeout=TIMEOUT_S, what=f"{unit} is back"
     )
+
+
+async def check_new_secret(machine: Booted) -> None:
+    """The running master takes a new secret, and refuses the old one: nothing of the services restarts."""
+    assert machine.run("stat -c %U:%G:%a /etc/rce/secret").strip() == "root:rce:640"
+    pids = [main_pid(machine, unit) for unit in UNITS]
+    await machine.run_soon(f"{BIN}/rce secret rotate /etc/rce/secret")
+    old = machine.run("tail -n 1 /etc/rce/secret").strip()
+    new = machine.run("head -n 1 /etc/rce/secret").strip()
+    assert [status_of(machine, secret) for secret in (old, new)] == [101, 101]
+    before = times_connected(machine)
+    await machine.run_soon(f"{BIN}/rce secret retire /etc/rce/secret")
+    assert [status_of(machine, secret) for secret in (old, new)] == [401, 101]
+    await until(
+        lambda: all(now > then for now, then in zip(times_connected(machine), before, strict=True)),
+        timeout=TIMEOUT_S,
+        what="both task sets showed the new secret",
+    )
+    assert [main_pid(machine, unit) for unit in UNITS] == pids
+
+
+_DIAL = """
+import socket, sys
+with socket.create_connection(("127.0.0.1", 8080), 30) as sock:
+    sock.sendall(
+        b"GET / HTTP/1.1\\r\\nHost: 127.0.0.1:8080\\r\\nUpgrade: websocket\\r\\nConnection: Upgrade\\r\\n"
+        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\\r\\nSec-WebSocket-Version: 13\\r\\n"
+        b"Authorization: Bearer " + sys.stdin.read().encode() + b"\\r\\n\\r\\n"
+    )
+    print(sock.recv(100).split()[1].decode())
+"""
+
+
+def status_of(machine: Booted, secret: str) -> int:
+    """Return what the master's control port answers one who shows a secret."""
+    return int(machine.run(f"{sys.executable} -c {shlex.quote(_DIAL)}", stdin=secret))
+
+
+def times_connected(machine: Booted) -> list[int]:
+    """Return how often each task set connected to the master."""
+    return [machine.journal(unit).count("connected to master") for unit in ("rce-robot", "rce-container")]
 
 
 async def check_reload(machine: Booted) -> None:

@@ -71,20 +71,29 @@ def test_master_and_robot_units_have_few_rights(role: Role, tmp_path: Path) -> N
 
 async def test_command_of_a_unit_starts_its_program(tmp_path: Path) -> None:
     settings = tmp_path / "settings with 100% $HOME.yaml"
-    settings.write_text(f"state_dir: '{tmp_path}/its state'\nmaster: {{http_port: 0, control_port: 0}}\n")
-    secret = tmp_path / "secret"
+    secret = tmp_path / "secret of 100%"
+    settings.write_text(
+        f"state_dir: '{tmp_path}/its state'\nmaster: {{http_port: 0, control_port: 0}}\n"
+        f"secret_file: '{secret}'\n"
+    )
     rce(tmp_path, "secret", "new", str(secret))
     text = rce(tmp_path, "install-service", "master", "--system", "--print", "--config", str(settings))
     argv = command_line(text)
-    assert argv[-2:] == ["--secret-file", "%d/secret"]
-    argv = [
-        word.replace("%d", str(tmp_path)).replace("%%", "%").replace("$$", "$")  # as systemd does
-        for word in argv
-    ]
+    argv = [word.replace("%%", "%").replace("$$", "$") for word in argv]  # as systemd does
+    assert argv[-2:] == ["--secret-file", str(secret)]
     program = Program("master", argv, dict(os.environ), tmp_path)
     await program.start(ready="rce-master ready: ", timeout=50)
     assert await program.stop() == 0
     assert (tmp_path / "its state" / "master").is_dir()
+
+
+@pytest.mark.parametrize("role", [Role.ENGINE, Role.MASTER, Role.ROBOT, Role.CONTAINER])
+def test_unit_reads_the_secret_where_it_is_changed(role: Role) -> None:
+    """systemd copies a credential once, so a program would never see that the secret was changed."""
+    secret = Path("/etc/rce/secret")
+    text = unit(Service(role=role, program=Path("/bin/true"), secret=secret))
+    assert command_line(text) == ["/bin/true", "--secret-file", str(secret)]
+    assert "LoadCredential" not in text
 
 
 @pytest.mark.needs("root")
