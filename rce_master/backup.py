@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 import sqlite3
+import stat
 import tarfile
 import tempfile
 import time
@@ -115,7 +116,8 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
     Args:
         file: The copy.
         folders: The folders of its parts.
-        replace: Move existing state aside, to ``FOLDER.before-DATE``.
+        replace: Move existing state aside, to ``FOLDER.before-DATE``. By root, a certificate or key that
+            replaces one keeps its owner and permissions: a service of another user may read some of them.
 
     Returns:
         The copy's manifest, and the folders of the former state.
@@ -143,6 +145,8 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
                     _move_aside(folder, former)
                 for part, folder in folders.items():
                     _move(Path(name) / part, folder)
+                    if part == CERTIFICATES:
+                        _keep_owners(folder, folder.with_name(f"{folder.name}.before-{stamp}"))
         except (OSError, tarfile.TarError) as error:
             places = " and ".join(map(str, aside))
             hint = f"; the former state is in {places}: to use it again, move it back" if aside else ""
@@ -388,3 +392,22 @@ def _move(source: Path, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     for path in sorted(source.iterdir(), key=lambda path: path.name == FILE_NAME):
         shutil.move(path, folder / path.name)
+
+
+def _keep_owners(folder: Path, former: Path) -> None:
+    """Give restored files the owners and permissions of those that they replace."""
+    if os.geteuid() != 0 or not former.is_dir():
+        return
+    # The folder may be another user's: nothing that this user links to changes.
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    for path in former.iterdir():
+        was = path.lstat()
+        with suppress(FileNotFoundError):
+            fd = os.open(folder / path.name, flags)
+            try:
+                found = os.fstat(fd)
+                if stat.S_ISREG(was.st_mode) and stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+                    os.fchown(fd, was.st_uid, was.st_gid)
+                    os.fchmod(fd, stat.S_IMODE(was.st_mode))
+            finally:
+                os.close(fd)

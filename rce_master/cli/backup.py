@@ -75,10 +75,11 @@ def restore_(
         else:
             target = place.etcd
             found = restore_to_etcd(file, place.folders[MASTER], place.etcd, place.tls)
-            give_to_owner(place.folders[MASTER])
     except StoreError as error:
         typer.echo(f"rce restore: {error}", err=True)
         raise typer.Exit(1) from None
+    finally:
+        give_to_owner(place.folders[MASTER])
     made = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(found.created))
     typer.echo(f"restored {target} as of {made}: {_about(found)}")
     for folder in aside:
