@@ -118,13 +118,15 @@ class SecretFile(Secret):
         SecretError: The file cannot be read, has no valid secret, or others can read it.
     """
 
-    __slots__ = ("_file", "_refused", "_seen", "_texts")
+    __slots__ = ("_fault", "_file", "_refused", "_seen", "_texts")
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._seen = _stamp(file)
         self._texts = _read_lines(file)
         self._refused: set[str] = set()
+        self._fault: object = None
+        """The last one that was logged."""
         super().__init__(self._texts[0])
 
     def reveal(self) -> str:
@@ -153,16 +155,20 @@ class SecretFile(Secret):
         return True
 
     def _look(self) -> None:
-        """Read the file again if it changed."""
+        """Read the file again if it changed, or could not be read: its permissions are not in its stamp."""
+        stamp = None
         try:
             stamp = _stamp(self._file)
             if stamp == self._seen:
                 return
-            self._seen = stamp
             self._texts = _read_lines(self._file)
         except SecretError as error:
-            _log.error("the former secret stays in use: %s", error)
+            fault = (stamp, str(error))
+            if fault != self._fault:
+                _log.error("the former secret stays in use: %s", error)
+            self._fault = fault
             return
+        self._seen, self._fault = stamp, None
         self._text = self._texts[0]
         self._refused.clear()
         _log.info("%s was read again: %d accepted", self._file, len(self._texts))
@@ -274,12 +280,14 @@ def _stamp(file: Path) -> tuple[int, int, int]:
 def _read_lines(file: Path) -> list[str]:
     """Read the secrets of a file, the current one first."""
     try:
-        mode = file.stat().st_mode
+        found = file.stat()
         text = file.read_text("ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise SecretError(f"cannot read the secret from {file}: {error}") from error
-    if stat.S_ISREG(mode) and mode & (stat.S_IRWXG | stat.S_IRWXO) & ~stat.S_IRGRP:
-        raise SecretError(f"{file} can be read by other users; run: chmod 600 {file}")
+    if stat.S_ISREG(found.st_mode) and found.st_mode & (stat.S_IRWXG | stat.S_IRWXO) & ~stat.S_IRGRP:
+        # A service's file is root's, and read through its group.
+        allowed = "640" if found.st_uid == 0 and found.st_gid != 0 else "600"
+        raise SecretError(f"{file} can be read by other users; run: chmod {allowed} {file}")
     lines = [line for line in text.splitlines() if line.strip()]
     return [Secret(line).reveal() for line in lines or [""]]
 

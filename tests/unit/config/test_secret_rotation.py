@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import stat
 from typing import TYPE_CHECKING
 
@@ -59,4 +60,30 @@ def test_file_that_went_bad_changes_nothing(tmp_path: Path, text: str) -> None:
     file.unlink()
     assert used.reveal() == old
     with pytest.raises(SecretError):
+        read_secret(file)
+
+
+def test_file_is_read_once_its_permissions_are_repaired(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, other = tmp_path / "secret", tmp_path / "other"
+    old = new_secret(file).reveal()
+    used = read_secret(file)
+    new = new_secret(other).reveal()
+    other.chmod(0o644)
+    other.replace(file)
+    for _ in range(3):
+        assert (used.matches(new), used.matches(old)) == (False, True)
+    assert caplog.text.count(f"run: chmod 600 {file}") == 1
+    file.chmod(0o600)
+    assert (used.matches(new), used.matches(old)) == (True, False)
+
+
+@pytest.mark.needs("root")
+def test_advice_keeps_a_services_file_readable(tmp_path: Path) -> None:
+    file = tmp_path / "secret"
+    new_secret(file)
+    os.chown(file, 0, 4711)
+    file.chmod(0o644)
+    with pytest.raises(SecretError, match="chmod 640"):
         read_secret(file)
