@@ -86,7 +86,8 @@ def last_line(folder: Path, name: str = ENVIRONMENT_LOG, *, within: int = 4096) 
 
 def _raw(folder: Path, name: str, offset: int, limit: int, *, before: int = 0) -> _Raw:
     """Read bytes, and up to ``before`` bytes in front of them."""
-    kept = [(start, path, _size(path)) for start, path in segments(folder, name)]
+    found = [(start, path, _size(path)) for start, path in segments(folder, name)]
+    kept = [(start, path, size) for start, path, size in found if size is not None]
     if not kept:
         what = {ENVIRONMENT_LOG: "the environment", ROSOUT_LOG: "ROS's log records"}.get(name, name)
         raise FileNotFoundError(f"there is no log of {what}")
@@ -98,13 +99,22 @@ def _raw(folder: Path, name: str, offset: int, limit: int, *, before: int = 0) -
     at = offset
     for start, path, size in kept:
         if start <= at < start + size and len(data) < limit:
-            data += _read(path, at - start, min(limit - len(data), start + size - at))
+            try:
+                data += _read(path, at - start, min(limit - len(data), start + size - at))
+            except FileNotFoundError:  # the environment removed it meanwhile: what is kept begins after it
+                if data:
+                    break
+                first = offset = start + size
             at = offset + len(data)
     return _Raw(bytes(data), offset, offset == first)
 
 
-def _size(path: Path) -> int:
-    found = path.lstat()
+def _size(path: Path) -> int | None:
+    """Return the size of a segment; None if the environment removed it meanwhile."""
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return None
     return found.st_size if stat.S_ISREG(found.st_mode) else 0
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce_container import logs
 from rce_container.environment.logs.files import SEGMENTS, LogWriter, segments
 from rce_container.logs import read_log
 
@@ -54,6 +55,27 @@ def test_its_size_is_bounded_and_offsets_stay_valid(tmp_path: Path) -> None:
     assert oldest.offset > 700, "what is not kept is passed over"
     assert read_log(tmp_path, "n", -20, 1000).text == "line 0098\nline 0099\n"
     assert read_log(tmp_path, "n", 5000, 10).offset == 1000
+
+
+@pytest.mark.parametrize("gone_before", ["_size", "_read"])
+def test_segment_that_is_removed_while_read_is_left_out(
+    gone_before: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The environment may remove the oldest one at any moment."""
+    log = LogWriter(tmp_path, "n", segment_bytes=10)
+    log.write(b"line 0000\n")
+    log.write(b"line 0001\n")
+    log.close()
+    oldest = segments(tmp_path, "n")[0][1]
+    step = getattr(logs, gone_before)
+
+    def rotate_then(path: Path, *arguments: int) -> object:
+        oldest.unlink(missing_ok=True)
+        return step(path, *arguments)
+
+    monkeypatch.setattr(logs, gone_before, rotate_then)
+    chunk = read_log(tmp_path, "n", 0, 1000)
+    assert (chunk.text, chunk.offset) == ("line 0001\n", 20)
 
 
 def test_a_second_writer_goes_on(tmp_path: Path) -> None:
