@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,15 +13,15 @@ import typer
 from rce.control import LogLevel
 from rce.printable import for_terminal, one_line
 from rce_master.cli import credentials
+from rce_master.cli.attempts import NOT_NOW
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import ApiError
+from rce_master.cli.exceptions import ApiError, CliError
 
 if TYPE_CHECKING:
     from rce_master.events import Event
 
 POLL_S = 0.3
 CHUNK = 65536
-_UNAVAILABLE = 503
 _NOT_FOUND = 404
 
 
@@ -61,13 +62,15 @@ def logs(
 async def _logs(path: str, follow: bool, offset: int, query: dict[str, str]) -> None:
     container, _, node = path.partition("/")
     url = f"/containers/{container}/nodes/{node}/log" if node else f"/containers/{container}/log"
-    incarnation, told = "", ""
+    incarnation, told, reached = "", "", False
     async with ApiClient.of(credentials.load()) as client:
         while True:
             place = {"limit": CHUNK, "offset": offset}
             of_incarnation = {"life": incarnation} if incarnation else {}
-            chunk = await _read(client, url, {**query, **place, **of_incarnation}, patient=follow)
+            asked: dict[str, str | int] = {**query, **place, **of_incarnation}
+            chunk = await _read(client, url, asked, patient=follow, reached=reached)
             if chunk is not None:
+                reached = True
                 if chunk["ended"] and told != chunk["life"]:
                     told = chunk["life"]
                     typer.echo(_obituary(chunk), err=True)
@@ -87,7 +90,7 @@ async def _started_again(client: ApiClient, url: str, query: dict[str, str], inc
     """Whether the container has a newer incarnation than the one that was read to its end."""
     now = {name: value for name, value in query.items() if name == "user"}
     try:
-        chunk = await _read(client, url, {**now, "limit": 1}, patient=True)
+        chunk = await _read(client, url, {**now, "limit": 1}, patient=True, reached=True)
     except ApiError as error:
         if error.status == _NOT_FOUND:
             return False
@@ -107,13 +110,25 @@ def _obituary(chunk: dict[str, Any]) -> str:
 
 
 async def _read(
-    client: ApiClient, url: str, query: dict[str, str | int], *, patient: bool
+    client: ApiClient, url: str, query: dict[str, str | int], *, patient: bool, reached: bool
 ) -> dict[str, Any] | None:
-    """Read a piece; return None if the container is unreachable for now and the program can wait."""
+    """Read a piece; return None if there is none for now and the program can wait.
+
+    Args:
+        client: Of the master.
+        url: The log.
+        query: Which piece.
+        patient: Wait for a container that is unreachable.
+        reached: The master answered before, so a patient program waits for it too: it may restart.
+
+    Raises:
+        CliError: The log cannot be read.
+    """
     try:
         chunk: dict[str, Any] = await client.call("GET", url, query=query)
-    except ApiError as error:
-        if patient and error.status == _UNAVAILABLE:
+    except CliError as error:
+        status = error.status if isinstance(error, ApiError) else HTTPStatus.BAD_GATEWAY
+        if patient and status in (NOT_NOW if reached else (HTTPStatus.SERVICE_UNAVAILABLE,)):
             return None
         raise
     return chunk

@@ -9,7 +9,7 @@ import pytest
 from rce.control.logs import LogLevel
 from rce_master.cli import credentials, follow
 from rce_master.cli.client import ApiClient
-from rce_master.cli.exceptions import ApiError
+from rce_master.cli.exceptions import ApiError, CliError
 
 
 class Server:
@@ -21,6 +21,8 @@ class Server:
         self.urls: list[str] = []
         self.born_later: dict[str, str] = {}
         self.reads_left = 100
+        self.faults: dict[int, CliError] = {}
+        """By the numbers of the requests that they answer."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -31,6 +33,8 @@ class Server:
         assert method == "GET"
         self.urls.append(url)
         self.queries.append(query)
+        if fault := self.faults.get(len(self.queries)):
+            raise fault
         if not self.reads_left:
             raise ApiError(401, "enough")
         self.reads_left -= 1
@@ -81,6 +85,27 @@ async def test_following_goes_on_with_the_next_life(
     captured = capsys.readouterr()
     assert captured.out == "second lifethird life"
     assert captured.err.count("-- the container's incarnation two ended") == 1
+
+
+async def test_following_continues_after_the_masters_restart(
+    server: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At the log's end too, where it asks whether the container was started again."""
+    refused = CliError("cannot use the master: connection refused")
+    server.faults = {2: refused, 3: ApiError(502, "bad gateway"), 7: refused, 9: refused, 11: refused}
+    server.lives = {"one": "first life"}
+    server.reads_left = 20
+    with pytest.raises(ApiError, match="enough"):
+        await follow._logs("c/n", follow=True, offset=0, query={})
+    assert capsys.readouterr().out == "first life"
+
+
+@pytest.mark.parametrize(("follows", "fault"), [(True, 1), (False, 2)])
+async def test_master_that_is_away_ends_the_command(server: Server, follows: bool, fault: int) -> None:
+    """A master that was never reached is not waited for, and neither is any without ``--follow``."""
+    server.faults = {fault: CliError("connection refused")}
+    with pytest.raises(CliError, match="refused"):
+        await follow._logs("c/n", follow=follows, offset=0, query={})
 
 
 def test_options_become_a_query(monkeypatch: pytest.MonkeyPatch) -> None:
