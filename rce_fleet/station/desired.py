@@ -6,7 +6,7 @@ A fleet without its planner stands still, so the operator's nodes are started ag
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, assert_never
 
 from rce.config.client import ClientConfig
 from rce.model import ConfigureComponents, RemoveNode, Request
@@ -61,6 +61,16 @@ class Desired:
         """Forget everything: the cells have other numbers now, or the fleet manager keeps goals and cells."""
         self._goals.clear()
         self._cells.clear()
+
+    def holds(self, desired: DesiredCell | DesiredGoal) -> bool:
+        """Return whether this is still the newest request for its robot or cell."""
+        match desired:
+            case DesiredCell(cell, blocked):
+                return self._cells.get(cell) is blocked
+            case DesiredGoal(robot, cell):
+                return self._goals.get(robot) == cell
+            case _:
+                assert_never(desired)
 
     def unmet(self, state: dict[str, Any]) -> list[DesiredCell | DesiredGoal]:
         """Return what is missing in a planner's ``state`` (a fleet/FleetState in its JSON form).

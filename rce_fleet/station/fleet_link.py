@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
 from math import inf
 from typing import Any, assert_never
 
@@ -89,6 +90,8 @@ class FleetLink:
         self._began_at = 0.0
         self._is_away = False
         self._desired = Desired()
+        self._unanswered: Counter[str | int] = Counter()
+        """Robots and cells with requests that the planner has not answered yet."""
         self._planner_started: str | None = None
         self._planner_restarted = asyncio.Event()
         self._grid_came = asyncio.Event()
@@ -115,8 +118,9 @@ class FleetLink:
         Raises:
             PlannerError: The planner refused, or cannot be reached.
         """
-        said = await self._call(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
-        self._desired.set_goal(robot, cell)
+        with self._asking(robot):
+            said = await self._call(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
+            self._desired.set_goal(robot, cell)
         return said
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
@@ -125,8 +129,9 @@ class FleetLink:
         Raises:
             PlannerError: The planner refused, or cannot be reached.
         """
-        said = await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
-        self._desired.set_cell(cell, blocked=blocked)
+        with self._asking(cell):
+            said = await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
+            self._desired.set_cell(cell, blocked=blocked)
         return said
 
     def forget_cell(self, cell: int) -> None:
@@ -199,6 +204,17 @@ class FleetLink:
             PlannerUnavailableError: It does not answer.
         """
         return await self._client.call(FLEET_REQUEST, request)
+
+    @contextlib.contextmanager
+    def _asking(self, subject: str | int) -> Iterator[None]:
+        """Send nothing of before about a robot or cell while a request about it is on its way."""
+        self._unanswered[subject] += 1
+        try:
+            yield
+        finally:
+            self._unanswered[subject] -= 1
+            if not self._unanswered[subject]:
+                del self._unanswered[subject]
 
     async def _call(self, service: PlannerService, request: dict[str, Any]) -> str:
         return str((await self._ask(service, request))["message"])
@@ -292,12 +308,16 @@ class FleetLink:
 
     async def _send_unmet(self) -> None:
         for desired in self._desired.unmet(self._view.state) if self._view.state else ():
+            if not self._desired.holds(desired):  # changed while those before it were sent
+                continue
             with contextlib.suppress(PlannerError):
                 match desired:
                     case DesiredCell(cell, blocked):
-                        await self.block_cell(cell, blocked=blocked)
+                        if cell not in self._unanswered:
+                            await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
                     case DesiredGoal(robot, cell):
-                        await self.set_goal(robot, cell)
+                        if robot not in self._unanswered:
+                            await self._call(SET_GOAL, {"robot": robot, "cell": cell})
                     case _:
                         assert_never(desired)
 

@@ -34,6 +34,8 @@ class Planner(PlannerClient):
         super().__init__("away")
         self.manager_is_here = True
         self.goals: list[tuple[str, int]] = []
+        self.gates: dict[tuple[str, int], asyncio.Event] = {}
+        """Goals that are answered only once the event is set."""
         self._calls |= {
             FLEET_REQUEST: self._ask_manager,
             SET_GOAL: self._set_goal,
@@ -52,7 +54,10 @@ class Planner(PlannerClient):
         return {"status": 200, "body": json.dumps(body), "revision": ""}
 
     async def _set_goal(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.goals.append((request["robot"], request["cell"]))
+        goal = request["robot"], request["cell"]
+        self.goals.append(goal)
+        if goal in self.gates:
+            await self.gates[goal].wait()
         return {"ok": True, "message": "drives"}
 
     async def _get_state(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -115,3 +120,46 @@ async def test_a_goal_is_sent_again_while_the_manager_is_away() -> None:
         async with asyncio.timeout(60):
             while ("Robot1", 5) not in planner.goals:
                 await asyncio.sleep(0.02)
+
+
+async def until_sent(planner: Planner, robot_id: str, cell: int) -> None:
+    async with asyncio.timeout(60):
+        while (robot_id, cell) not in planner.goals:
+            await asyncio.sleep(0.02)
+
+
+async def test_a_goal_cancelled_meanwhile_is_not_sent_again() -> None:
+    """The resent goals of two robots are on their way: one is cancelled before its turn, one after it."""
+    async with running() as (planner, link, _, _):
+        for name, cell in (("Robot1", 5), ("Robot2", 6)):
+            await link.set_goal(name, cell)
+        planner.goals.clear()
+        planner.gates["Robot1", 5] = asyncio.Event()
+        link.take_state(of("2.0"))
+        await until_sent(planner, "Robot1", 5)
+        await link.set_goal("Robot1", None)
+        await link.set_goal("Robot2", None)
+        await link.set_goal("Robot2", 7)
+        planner.goals.clear()
+        planner.gates["Robot1", 5].set()
+        await until_sent(planner, "Robot2", 7)  # in the next round
+        assert {("Robot1", 5), ("Robot2", 6)}.isdisjoint(planner.goals)
+
+
+async def test_a_goal_is_not_sent_behind_its_cancellation() -> None:
+    """The planner has not answered the cancellation when the goal's turn comes."""
+    async with running() as (planner, link, _, _):
+        for name, cell in (("Robot1", 5), ("Robot2", 6)):
+            await link.set_goal(name, cell)
+        planner.goals.clear()
+        planner.gates = {("Robot1", 5): asyncio.Event(), ("Robot2", -1): asyncio.Event()}
+        link.take_state(of("2.0"))
+        await until_sent(planner, "Robot1", 5)
+        cancelling = asyncio.create_task(link.set_goal("Robot2", None))
+        await until_sent(planner, "Robot2", -1)
+        planner.goals.clear()
+        planner.gates["Robot1", 5].set()
+        await until_sent(planner, "Robot1", 5)  # in the next round
+        assert ("Robot2", 6) not in planner.goals
+        planner.gates["Robot2", -1].set()
+        await cancelling
