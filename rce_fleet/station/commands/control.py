@@ -128,11 +128,13 @@ class RobotControl:
             group.create_task(self._prepare_stops())
 
     async def close(self) -> None:
-        """Close all connections. Robots that are stopped stay stopped."""
+        """Close all connections, side by side. Robots that are stopped stay stopped."""
         await cancel_and_wait(*self._opening.values())
-        for sender in self._stops.values():
-            await sender.close()
+        senders = [sender.close() for sender in self._stops.values()]
         self._stops.clear()
+        for error in await asyncio.gather(*senders, return_exceptions=True):
+            if error is not None:
+                _log.warning("a connection for emergency stops was not closed: %s", error)
 
     async def emergency_stop(self, robots: Iterable[str] | None, user: str, *, stopped: bool) -> StopResult:
         """Stop robots at once, or release them.
@@ -258,6 +260,8 @@ class RobotControl:
                 except (CommandError, TimeoutError) as error:
                     self._refused_at[robot] = asyncio.get_running_loop().time()
                     _log.debug("no emergency stop for %s: %s", robot, error)
+                except Exception as error:  # noqa: BLE001 - the others must be stopped all the same
+                    _log.warning("the connection for emergency stops of %s failed: %r", robot, error)
                 else:
                     if sender.is_connected:
                         self._send_again(robot, sender)

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
+from rce.ros.closing import release
 from rce.ros.errors import MasterError, NodeClosedError
 from rce_client.exceptions import ClientError
 from rce_fleet.station.commands.kinds import EMERGENCY_STOP
@@ -266,7 +267,7 @@ class _RosSender(CommandSender):
                 )
             except Exception as error:
                 raise CommandError(f"the ROS graph of {self._robot} cannot be reached: {error}") from error
-            stack.push_async_callback(publisher.close)
+            stack.push_async_callback(release, publisher)
             before, self._stack = self._stack, stack.pop_all()
             self._node, self._publisher = node, publisher
             if self._last is not None and command.is_latched:

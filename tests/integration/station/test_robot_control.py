@@ -393,3 +393,27 @@ async def test_a_stop_follows_a_robot_into_its_own_graph() -> None:
             result = await control.emergency_stop(None, "op", stopped=False)
             assert (result.reached, control.stopped) == (("Robot1",), {})
             await control.close()
+
+
+async def test_a_stop_follows_a_robot_whose_master_moves() -> None:
+    """The robot restarts, and its master has another port then. The station ends while it is away."""
+    network = DiscoveryNetwork()
+    stops: deque[bool] = deque()
+    async with Core(port=0) as planner, Discovery(network.settings(planner.uri, name="planner")):
+        control = RobotControl(RosCommandSource(RosLayerSource(planner.uri, TYPES)), lambda: ["Robot1"])
+        await control.emergency_stop(None, "op", stopped=True)
+        keeping = asyncio.create_task(control.run())
+        for _ in range(2):
+            stops.clear()
+            async with (
+                Core(port=0) as core,
+                Node("safety", argv=[], master_uri=core.uri, types=TYPES) as node,
+                Discovery(network.settings(core.uri, name="Robot1")),
+            ):
+                await node.subscribe("/emergency_stop", "std_msgs/Bool", lambda said: stops.append(said.data))
+                async with asyncio.timeout(LIMIT_S):
+                    while True not in stops:
+                        assert not keeping.done()
+                        await asyncio.sleep(0.05)
+        await cancel_and_wait(keeping)
+        await control.close()

@@ -24,6 +24,9 @@ class Sender(CommandSender):
         self.sent: list[bool] = []
         self.connected = True
         self.is_broken = False
+        self.is_lost = False
+        """Whether it can be neither repaired nor closed."""
+        self.is_closed = False
         self.tries = 0
 
     def send(self, message: dict[str, Any]) -> None:
@@ -36,9 +39,14 @@ class Sender(CommandSender):
     def is_connected(self) -> bool:
         return self.connected
 
-    async def repair(self) -> None: ...
+    async def repair(self) -> None:
+        if self.is_lost:
+            raise RuntimeError("lost")
 
-    async def close(self) -> None: ...
+    async def close(self) -> None:
+        if self.is_lost:
+            raise RuntimeError("lost")
+        self.is_closed = True
 
 
 class Robots(CommandSource):
@@ -250,3 +258,18 @@ def test_a_tag_names_its_robot() -> None:
 
 def test_fleets_do_not_share_their_stops(tmp_path: Path) -> None:
     assert stops_file(tmp_path, "a") != stops_file(tmp_path, "b")
+
+
+async def test_a_lost_connection_leaves_the_others_alone() -> None:
+    """They are still kept ready and told, and closed at the end."""
+    robots = Robots("Robot1", "Robot2")
+    control = RobotControl(robots, lambda: ["Robot1", "Robot2", "Robot3"])
+    async with running(control):
+        await until(lambda: set(robots.senders) == {"Robot1", "Robot2"})
+        robots.senders["Robot1"].is_lost = True
+        robots.senders["Robot1"].connected = False
+        await control.emergency_stop(["Robot3"], "op", stopped=True)
+        robots.here.add("Robot3")
+        await until(lambda: robots.last("Robot3") is True)
+    assert robots.senders["Robot2"].is_closed
+    assert robots.senders["Robot3"].is_closed
