@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rce.aio.tasks import TaskScope
+from rce.ros.closing import release
 from rce.ros.errors import NodeClosedError, RosError, ServiceError
 from rce.ros.node import Node, ServiceClient
 from rce.ros.types import Duration, Message, Time, TypeRegistry
@@ -36,6 +37,7 @@ from rce_fleet.station.planner_client import (
     PlannerUnavailableError,
     pose_topic,
 )
+from rce_fleet.station.ros_subscriptions import subscribe_when_reachable
 
 NODE = "operator_station"
 
@@ -70,25 +72,27 @@ class RosPlannerClient(PlannerClient):
             watching.spawn(_fail_on_shutdown(node), name="until the node is told to stop")
             for service in (SET_GOAL, BLOCK_CELL, GET_STATE, SET_GRID, SET_MODE, FLEET_REQUEST):
                 self._calls[service] = _caller(node.service_client(service.name, service.type_name))
-            states = await node.subscribe(STATE_TOPIC, STATE, take_state)
+            states = await subscribe_when_reachable(node, STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
             await ready()
-            await node.subscribe(
-                CHANGES_TOPIC, CHANGES, lambda message: listener.take_changes(plain(message))
+            await subscribe_when_reachable(
+                node, CHANGES_TOPIC, CHANGES, lambda message: listener.take_changes(plain(message))
             )
             listener.may_have_missed()
-            await node.subscribe(POSES_TOPIC, POSES, lambda message: listener.take_poses(plain(message)))
-            await node.subscribe(
-                EVENTS_TOPIC, EVENTS, lambda message: listener.take_fleet_event(message.data)
+            await subscribe_when_reachable(
+                node, POSES_TOPIC, POSES, lambda message: listener.take_poses(plain(message))
+            )
+            await subscribe_when_reachable(
+                node, EVENTS_TOPIC, EVENTS, lambda message: listener.take_fleet_event(message.data)
             )
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._follow_robots(listener))
                 group.create_task(self._read_grid(listener))
                 while True:
                     await self._changes_followed.wait()
-                    await states.close()
+                    await release(states)
                     await self._states_needed.wait()
-                    states = await node.subscribe(STATE_TOPIC, STATE, take_state)
+                    states = await subscribe_when_reachable(node, STATE_TOPIC, STATE, take_state)
 
     async def _read_grid(self, listener: PlannerListener) -> None:
         """Receive the grid once for each start of the planner: each blocked cell publishes it anew."""
@@ -102,17 +106,17 @@ class RosPlannerClient(PlannerClient):
             await self._grid_needed.wait()
             self._grid_needed.clear()
             came.clear()
-            grid = await self._node.subscribe(GRID_TOPIC, GRID, take)
+            grid = await subscribe_when_reachable(self._node, GRID_TOPIC, GRID, take)
             await came.wait()
-            await grid.close()
+            await release(grid)
 
     async def _follow_robots(self, listener: PlannerListener) -> None:
         while True:
             await self._follow(listener, await self._new_robots.get())
 
     async def _follow(self, listener: PlannerListener, robot: str) -> None:
-        await self._node.subscribe(
-            pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
+        await subscribe_when_reachable(
+            self._node, pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
         )
 
 

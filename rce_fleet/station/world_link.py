@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field
 
+from rce.ros.closing import release
 from rce.ros.errors import RosError
 from rce.ros.node import Node
 from rce.web.bodies import read_whole
@@ -23,6 +24,7 @@ from rce.web.routes import Route, RouteTable
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.station.access import AccessControl, problem
 from rce_fleet.station.api import Answer
+from rce_fleet.station.ros_subscriptions import subscribe_when_reachable
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, TypeRegistry
@@ -95,15 +97,19 @@ class WorldLink:
         """Receive the world's truth until cancelled."""
         async with self._node as node:
             if self._on_things is not None:
-                await node.subscribe("/simulation/things", "std_msgs/String", self._take_things)
+                await subscribe_when_reachable(
+                    node, "/simulation/things", "std_msgs/String", self._take_things
+                )
             while True:
                 if self._wanted is not None:
                     await self._wanted.wait()
-                states = await node.subscribe("/gazebo/model_states", "gazebo_msgs/ModelStates", self._take)
+                states = await subscribe_when_reachable(
+                    node, "/gazebo/model_states", "gazebo_msgs/ModelStates", self._take
+                )
                 # A page that is loaded again is back before it is noticed.
                 while self._wanted is None or self._wanted.is_set():  # noqa: ASYNC110 - see above
                     await asyncio.sleep(LOOK_AWAY_S)
-                await states.close()
+                await release(states)
 
     def _take_things(self, message: Message) -> None:
         try:

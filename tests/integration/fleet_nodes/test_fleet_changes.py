@@ -40,13 +40,21 @@ async def planner(core: Core) -> AsyncIterator[asyncio.subprocess.Process]:
 
 
 class Client(RosPlannerClient):
-    """Tells when whole states are not needed any more."""
+    """Tells when whole states are not needed any more, and when they are again."""
 
     follows_changes = False
+
+    def __init__(self, master_uri: str, types: TypeRegistry) -> None:
+        super().__init__(master_uri, types)
+        self.needs_states = asyncio.Event()
 
     def stop_states(self) -> None:
         self.follows_changes = True
         super().stop_states()
+
+    def receive_states(self) -> None:
+        self.needs_states.set()
+        super().receive_states()
 
 
 class LossyLink(FleetLink):
@@ -227,3 +235,23 @@ async def test_an_earlier_planner_may_replace_a_newer_one(monkeypatch: pytest.Mo
                 await station.until(lambda: station.view.blocked() == [9])
         told = [text for text in station.events if "publishes no changes" in text]
         assert len(told) == 1
+
+
+async def test_a_station_outlives_core_and_planner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It asks for whole states while both are away, and follows the planner that comes after."""
+    monkeypatch.setattr(fleet_link, "SILENT_S", 2.0)
+    async with AsyncExitStack() as stack:
+        async with Core(port=0) as core, planner(core):
+            station = Station(core)
+            await stack.enter_async_context(station.running())
+            await station.until(lambda: station.client.follows_changes)
+            await station.block(9)
+            await station.until(lambda: station.view.blocked() == [9])
+        async with asyncio.timeout(WAIT_S):
+            await station.client.needs_states.wait()
+        await asyncio.sleep(0.5)  # it has tried to subscribe
+        station.client.follows_changes = False
+        async with Core(port=int(core.uri.rstrip("/").rpartition(":")[2])) as again, planner(again):
+            await station.until(lambda: station.client.follows_changes)
+            await station.block(10)
+            await station.until(lambda: station.view.blocked() == [9, 10])

@@ -12,11 +12,13 @@ from typing import Any
 import pytest
 from support.engine import Program
 
+from rce.aio.tasks import cancel_and_wait
+from rce.ros.core import Core
+from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce_fleet.station import world_link
 from rce_fleet.station.world_link import WorldError, WorldLink, WorldRequest
-
-pytestmark = pytest.mark.needs("pymunk")
 
 SCENE = """
 robots: [{id: Robot1, at: [1, 1]}]
@@ -27,6 +29,7 @@ LIMIT_S = 60
 Until = Callable[..., Awaitable[None]]
 
 
+@pytest.mark.needs("pymunk")
 async def test_an_operator_changes_a_simulated_world(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     argv = [sys.executable, "-c", "from rce.cli import main; main()", "sim", str(tmp_path / "scene.yaml")]
@@ -113,3 +116,31 @@ async def check_starts(world: WorldLink, until_place: Until, until_told: Until) 
     await world.act(WorldRequest(action="reset"))
     await until_place("Robot1", 5, 2.5)
     await until_place("Light1", 2, 2.5)
+
+
+async def test_pages_come_and_go_while_the_world_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The world's truth is there again once its ROS master is."""
+    monkeypatch.setattr(world_link, "LOOK_AWAY_S", 0.05)
+    types, wanted, told = TypeRegistry(PackageIndex([])), asyncio.Event(), asyncio.Event()
+    wanted.set()
+
+    async def until_told(core: Core) -> None:
+        async with Node("world", argv=[], master_uri=core.uri, types=types, signals=False) as node:
+            states = await node.advertise("/gazebo/model_states", "gazebo_msgs/ModelStates", latch=True)
+            states.publish(name=["box1"], pose=[{}])
+            told.clear()
+            async with asyncio.timeout(LIMIT_S):
+                await told.wait()
+
+    async with Core(port=0) as core:
+        link = WorldLink(core.uri, types, lambda _: told.set(), wanted)
+        running = asyncio.create_task(link.run())
+        await until_told(core)
+    wanted.clear()
+    await asyncio.sleep(0.5)
+    wanted.set()
+    await asyncio.sleep(0.5)
+    async with Core(port=int(core.uri.rstrip("/").rpartition(":")[2])) as again:
+        assert not running.done()
+        await until_told(again)
+        await cancel_and_wait(running)
