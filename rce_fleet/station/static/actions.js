@@ -11,7 +11,12 @@ const REFUSED = [404, 409, 422]; // of one cell: others can be tried
 
 const at = (robot, what) => `/robots/${encodeURIComponent(robot)}/${what}`;
 
+// What a change of a zone is for: this revision of it, and not one that another user made meanwhile; 0: there is none yet.
+const ifMatch = (revision) => ({ "If-Match": `"${revision}"` });
+
 export class Actions {
+  #restored = new Map(); // "zone revision" -> the revision at which undo made the zone so again
+
   constructor(fleet, operator, work) {
     this.fleet = fleet;
     this.operator = operator;
@@ -148,21 +153,39 @@ export class Actions {
 
   // before: the zone that is replaced; null: it is a new one.
   makeZone(id, zone, before = null) {
-    return this.operator.act(t("action.zone.done", { zone: id }), () => this.#putZone(id, zone), () => (before ? this.#putZone(id, before) : this.#dropZone(id)));
+    let made = null;
+    const run = async () => (made = await this.#putZone(id, zone, before?.revision ?? 0));
+    const undo = () => {
+      const revision = this.#revisionNow(id, made.revision);
+      return before ? this.#restoreZone(before, revision) : this.#dropZone(id, revision);
+    };
+    return this.operator.act(t("action.zone.done", { zone: id }), run, undo);
   }
 
-  #putZone(id, { kind, cells, value, reason, until = null, edges = [], robots = [] }) {
-    return ask("PUT", `/zones/${encodeURIComponent(id)}`, { kind, cells, value, reason, until, edges, robots });
+  #putZone(id, { kind, cells, value, reason, until = null, edges = [], robots = [] }, revision) {
+    return ask("PUT", `/zones/${encodeURIComponent(id)}`, { kind, cells, value, reason, until, edges, robots }, ifMatch(revision));
   }
 
-  async #dropZone(id) {
-    await ask("DELETE", `/zones/${encodeURIComponent(id)}`);
+  async #restoreZone(before, revision) {
+    const answer = await this.#putZone(before.id, before, revision);
+    this.#restored.set(`${before.id} ${before.revision}`, answer.revision);
+    return answer;
+  }
+
+  // Undo of earlier actions is for the zone that undo of later ones restored.
+  #revisionNow(id, revision) {
+    const restored = this.#restored.get(`${id} ${revision}`);
+    return restored === undefined ? revision : this.#revisionNow(id, restored);
+  }
+
+  async #dropZone(id, revision) {
+    await ask("DELETE", `/zones/${encodeURIComponent(id)}`, undefined, ifMatch(revision));
     return { message: t("action.zone.gone", { zone: id }) };
   }
 
-  removeZone(id) {
-    const before = this.work.zones.find((zone) => zone.id === id);
-    return this.operator.act(t("action.zone.gone", { zone: id }), () => this.#dropZone(id), () => this.#putZone(id, before));
+  // zone: as the operator saw it.
+  removeZone(zone) {
+    return this.operator.act(t("action.zone.gone", { zone: zone.id }), () => this.#dropZone(zone.id, zone.revision), () => this.#restoreZone(zone, 0));
   }
 
   // A stop takes one click; robots that are released drive on.

@@ -5,10 +5,10 @@ import { t } from "./texts.js";
 const MOST_UNDO = 20;
 
 // Send a request; return the answer, or throw an error with its text and status.
-export async function ask(method, path, body) {
+export async function ask(method, path, body, headers = {}) {
   const response = await fetch(path.startsWith("/api") ? path : `/api/v1${path}`, {
     method,
-    headers: { "Content-Type": "application/json" },
+    headers: { "Content-Type": "application/json", ...headers },
     body: body === undefined ? undefined : JSON.stringify(body),
   });
   const text = await response.text();

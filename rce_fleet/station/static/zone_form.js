@@ -6,6 +6,7 @@ const DEGREE = Math.PI / 180;
 export class ZoneForm {
   #cells = [];
   #zone = null; // the one that is changed
+  #isSending = false; // a second click would be refused: the zone exists then
 
   constructor(tools, actions, work) {
     this.actions = actions;
@@ -22,7 +23,7 @@ export class ZoneForm {
     tools.addEventListener("zone", ({ detail }) => this.#open(detail));
     tools.addEventListener("chosen", () => this.#close());
     document.querySelector("#zone-cancel").addEventListener("click", () => this.#close());
-    this.remove.addEventListener("click", async () => { if (await actions.removeZone(this.#zone.id)) this.#close(); });
+    this.remove.addEventListener("click", async () => { if (await actions.removeZone(this.#zone)) this.#close(); });
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.#submit();
@@ -60,6 +61,7 @@ export class ZoneForm {
   }
 
   async #submit() {
+    if (this.#isSending) return;
     const { kind, name, value } = this;
     const number = value.value === "" ? null : value.valueAsNumber * (kind.value === "one_way" ? DEGREE : 1);
     const words = (text) => text.split(",").map((word) => word.trim()).filter(Boolean);
@@ -72,7 +74,10 @@ export class ZoneForm {
       robots: words(this.robots.value),
       edges: words(this.edges.value).map((move) => move.split(">").map(Number)),
     };
-    if (await this.actions.makeZone(name.value, zone, this.#zone)) this.#close();
+    this.#isSending = true;
+    const answer = await this.actions.makeZone(name.value, zone, this.#zone);
+    this.#isSending = false;
+    if (answer) this.#close();
   }
 
   // When it ends, seconds since 1970; an end that was not changed keeps its fractions.

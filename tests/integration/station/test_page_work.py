@@ -199,6 +199,68 @@ async def test_a_zone_has_a_reason_an_end_robots_and_moves(tmp_path: Path) -> No
         assert (changed.robots, changed.until, changed.reason) == (("Robot1", "Robot2"), zone.until, "repair")
 
 
+async def put_zone(page: Page, cell: int, **fields: str) -> None:
+    """Fill and submit the form of a zone that a click on a cell opens."""
+    await page.locator("#tool-zone").click()
+    await page.evaluate("cell => rceFleet.tools.use(cell)", cell)
+    for name, text in fields.items():
+        await page.locator(f"#zone-{name}").fill(text)
+    await page.locator("#zone-kind").select_option("blocked")
+    await page.locator("#zone-form [type=submit]").click()
+
+
+async def test_a_new_zone_does_not_replace_one_of_its_name(tmp_path: Path) -> None:
+    """Neither one that the page shows, nor one that another user made after the form was opened."""
+    async with managed(tmp_path) as (_, client, page):
+        await client.ask("PUT", "/zones/gate", {"kind": "blocked", "cells": [3]})
+        await put_zone(page, 18, name="gate")
+        await page.locator("#message.bad", has_text="zone gate is at revision").wait_for()
+        assert client.manager.book.zones["gate"].cells == (3,)
+        assert await page.evaluate("rceFleet.operator.undoable") is None
+        await page.locator("#zone-name").fill("door")
+        await page.locator("#zone-form [type=submit]").click()  # it is still open
+        await page.locator("#zone-form").wait_for(state="hidden")
+        assert client.manager.book.zones["door"].cells == (18,)
+
+
+async def test_a_change_of_a_zone_that_changed_is_refused(tmp_path: Path) -> None:
+    """Also its removal, and undo of what another user has changed since."""
+    async with managed(tmp_path) as (_, client, page):
+        zones = client.manager.book.zones
+        theirs = {"kind": "blocked", "cells": [18, 19]}
+        await put_zone(page, 18, reason="mine")
+        await page.wait_for_function("rceFleet.work.zones.length === 1")
+        await page.evaluate("rceFleet.tools.use(18)")
+        await client.ask("PUT", "/zones/zone1", theirs)
+        for button in ("[type=submit]", "#zone-remove"):
+            await page.locator("#message").evaluate("message => { message.textContent = ''; }")
+            await page.locator(f"#zone-form {button}").click()
+            await page.locator("#message.bad", has_text="zone zone1 is at revision").wait_for()
+            assert zones["zone1"].cells == (18, 19)
+        await page.locator("#message").evaluate("message => { message.textContent = ''; }")
+        await page.locator("#undo:enabled").click()
+        await page.locator("#message.bad", has_text="zone zone1 is at revision").wait_for()
+        assert zones["zone1"].cells == (18, 19)
+
+
+async def test_changes_of_a_zone_are_undone_one_by_one(tmp_path: Path) -> None:
+    """Undo makes revisions, too: they are those that undo of earlier changes is for."""
+    async with managed(tmp_path) as (_, client, page):
+        zones = client.manager.book.zones
+        for reason in ("first", "second"):
+            await put_zone(page, 18, reason=reason)
+            await page.wait_for_function("reason => rceFleet.work.zones[0]?.reason === reason", arg=reason)
+        await page.evaluate("rceFleet.tools.use(18)")
+        await page.locator("#zone-remove").click()
+        await page.wait_for_function("rceFleet.work.zones.length === 0")
+        for reason in ("second", "first"):
+            await page.locator("#undo:enabled").click()
+            await page.wait_for_function("reason => rceFleet.work.zones[0]?.reason === reason", arg=reason)
+        await page.locator("#undo:enabled").click()
+        await page.wait_for_function("rceFleet.work.zones.length === 0")
+        assert "zone1" not in zones
+
+
 async def test_undo_of_a_mode_sets_the_one_before() -> None:
     """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
     async with site() as made:
