@@ -2,6 +2,7 @@
 
 import { exceptionsOf, fleetConditionsOf, isPossible, loadCells, rowsOf, taskConditionsOf } from "./conditions.js";
 import { element } from "./engine.js";
+import { placeRows } from "./rows.js";
 import { t } from "./texts.js";
 
 const DRAW_EVERY_MS = 1000;
@@ -19,7 +20,6 @@ const ANSWERS = {
 };
 
 export class Attention {
-  #drawn = "";
   #open = new Set(); // kinds of groups whose robots are shown
 
   // answer: (name, robot) => does it; answerTask: (name, task, cell)
@@ -44,17 +44,38 @@ export class Attention {
     const rows = [...rowsOf(found, this.fleet.stoppedBy !== null), ...tasks].sort((a, b) => b.conditions[0].severity - a.conditions[0].severity);
     const shown = rows.slice(0, MOST);
     const hidden = rows.slice(MOST).reduce((count, { robots }) => count + (robots?.length ?? 1), 0);
-    // Rebuilt only when something else is to be shown, so that a button keeps its focus.
-    const parts = shown.map(({ robots, task, conditions }) => [task ? [task.id, loadCells(task, this.fleet.robots)] : robots.map(({ id }) => id), conditions.map(({ kind }) => kind)]);
-    const key = JSON.stringify([this.steers, this.fleet.manager, whole, hidden, parts]);
-    if (key === this.#drawn) {
-      shown.forEach(({ conditions }, index) => { this.list.children[whole.length + index].querySelector(".why").textContent = conditions.map(({ text }) => text).join("; "); });
-      return;
+    const before = new Map([...this.list.children].map((item) => [item.dataset.key, item]));
+    // An item is made again only when something else than the text of its conditions changes.
+    const item = (parts, make) => {
+      const key = JSON.stringify(parts);
+      const known = before.get(key) ?? make();
+      known.dataset.key = key;
+      return known;
+    };
+    const items = whole.map(({ text }) => item(["whole", text], () => this.#line([text])));
+    for (const row of shown) {
+      const made = item(this.#partsOf(row), () => this.#row(row));
+      made.querySelector(".why").textContent = row.conditions.map(({ text }) => text).join("; ");
+      items.push(made);
     }
-    this.#drawn = key;
-    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((row) => this.#row(row)));
-    if (hidden) this.list.append(element("li", t("attention.more", { count: hidden }), "quiet"));
-    if (!rows.length && !whole.length) this.list.append(element("li", t("attention.none"), "quiet"));
+    if (hidden) items.push(item(["more", hidden], () => element("li", t("attention.more", { count: hidden }), "quiet")));
+    if (!items.length) items.push(item(["none"], () => element("li", t("attention.none"), "quiet")));
+    this.#place(items);
+  }
+
+  // What an item is made from, but for the text of its conditions.
+  #partsOf({ robots, task, conditions }) {
+    const subject = task ? [task.id, task.robot_assigned, task.rounds, loadCells(task, this.fleet.robots)] : robots.map(({ id }) => id);
+    return [this.steers, this.fleet.manager, subject, conditions.map(({ kind, severity }) => [kind, severity])];
+  }
+
+  // Show the items; a button that is moved or made again keeps the focus.
+  #place(items) {
+    const focused = this.list.contains(document.activeElement) ? document.activeElement : null;
+    placeRows(this.list, items);
+    if (!focused || document.activeElement === focused) return;
+    const again = [...this.list.querySelectorAll("[data-answer]")].find(({ dataset }) => dataset.answer === focused.dataset.answer);
+    (focused.isConnected ? focused : again)?.focus();
   }
 
   #row(row) {
@@ -75,6 +96,7 @@ export class Attention {
     const details = element("details");
     details.open = this.#open.has(kind);
     const summary = element("summary", t("attention.group", { count: robots.length }));
+    summary.dataset.answer = `group ${kind}`;
     summary.append(" ", element("span", text, "why"));
     details.append(summary);
     const fill = () => {
@@ -94,6 +116,7 @@ export class Attention {
       for (const [answer, label] of answers) {
         const button = element("button", t(label));
         button.type = "button";
+        button.dataset.answer = `${answer} ${kind}`;
         button.addEventListener("click", () => this.answer(answer, null));
         row.append(button);
       }
@@ -105,6 +128,7 @@ export class Attention {
   #name(id) {
     const name = element("button", id, "link");
     name.type = "button";
+    name.dataset.answer = `show ${id}`;
     name.addEventListener("click", () => this.answer("show", id));
     return name;
   }
@@ -119,6 +143,7 @@ export class Attention {
       for (const answer of names) {
         const button = element("button", t(`action.${answer}`));
         button.type = "button";
+        button.dataset.answer = `${answer} ${robot.id}`;
         button.setAttribute("aria-label", `${t(`action.${answer}`)}: ${robot.id}`);
         button.addEventListener("click", () => this.answer(answer, robot.id));
         row.append(button);
@@ -136,6 +161,7 @@ export class Attention {
     const add = (answer, label, cell = null) => {
       const button = element("button", label);
       button.type = "button";
+      button.dataset.answer = `${answer} ${cell} ${task.id}`;
       button.setAttribute("aria-label", `${label}: ${task.id}`);
       button.addEventListener("click", () => this.answerTask(answer, task.id, cell));
       row.append(button);

@@ -2,30 +2,13 @@
 
 import { clock, isAtRisk } from "./conditions.js";
 import { element } from "./engine.js";
+import { placeRows } from "./rows.js";
 import { t } from "./texts.js";
 import { ENDED } from "./work.js";
 
 const TONE = { running: "good", queued: "quiet", assigned: "quiet", held: "warn", suspended: "warn", cancelling: "warn", failed: "bad", cancelled: "quiet", done: "good" };
 
 const MOST_OPEN = 100;
-
-// Show rows in a table. One that looks as before stays where it is: a button that is replaced between press and
-// release would lose the click.
-function showRows(body, rows) {
-  const before = new Map([...body.children].map((row) => [row.dataset.key, row]));
-  const shown = rows.map((row) => {
-    const known = before.get(row.dataset.key);
-    before.delete(row.dataset.key);
-    return known?.isEqualNode(row) ? known : row;
-  });
-  const kept = new Set(shown);
-  for (const row of [...body.children]) if (!kept.has(row)) row.remove();
-  let next = body.firstElementChild;
-  for (const row of shown) {
-    if (row === next) next = next.nextElementSibling;
-    else body.insertBefore(row, next);
-  }
-}
 
 // Whether the action that is under way ends only when a person or a program confirms it.
 function awaitsConfirmation({ visits, stops }) {
@@ -54,7 +37,8 @@ export class TasksPanel {
     const focused = document.activeElement?.id;
     const rows = tasks.flatMap((task) => [this.#row(task), this.#buttons(task)]);
     if (more > 0) rows.splice(2 * open.length, 0, this.#more(more));
-    showRows(this.body, rows);
+    const before = new Map([...this.body.children].map((row) => [row.dataset.key, row]));
+    placeRows(this.body, rows.map((row) => (before.get(row.dataset.key)?.isEqualNode(row) ? before.get(row.dataset.key) : row)));
     if (focused?.startsWith("task-")) document.getElementById(focused)?.focus();
   }
 

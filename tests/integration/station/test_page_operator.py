@@ -166,6 +166,38 @@ async def test_a_silent_robot_comes_first_with_its_answers() -> None:
         )
 
 
+async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
+    """A press and its release hit the same button, and the focus stays, also in a row that is made again."""
+    async with site() as made:
+        page = await made.open()
+
+        def tell(name: str, robot_state: str) -> None:
+            made.feed.on_change(made.view.on_changes(changes(robot(name, state=robot_state, reason="why"))))
+
+        tell("Robot1", "unreachable")
+        cancel = page.locator("#attention-list button[aria-label$=': Robot1']", has_text="Cancel")
+        other = page.locator("#attention-list li", has_text="Robot2")
+        await cancel.scroll_into_view_if_needed()
+        await cancel.hover()
+        await page.mouse.down()
+        tell("Robot2", "silent")
+        await other.wait_for()
+        async with page.expect_request("**/robots/Robot1/goal"):
+            await page.mouse.up()
+        tell("Robot1", "unreachable")
+        await cancel.focus()
+        tell("Robot2", "idle")
+        await other.wait_for(state="detached")
+        async with page.expect_request("**/robots/Robot1/goal"):
+            await page.keyboard.press("Enter")
+        tell("Robot1", "unreachable")
+        await cancel.focus()
+        made.feed.on_control({"Robot1": "an operator"}, {})
+        await page.locator("#attention-list button", has_text="Release").wait_for()
+        async with page.expect_request("**/robots/Robot1/goal"):
+            await page.keyboard.press("Enter")
+
+
 async def test_the_page_tells_that_the_planner_is_away() -> None:
     """Also a page that is opened later; what it shows is old."""
     async with site() as made:
