@@ -58,17 +58,19 @@ export class Drive {
     this.#sent.clear();
     this.#answered = performance.now();
     this.#roundTrip = 0;
-    socket.addEventListener("message", ({ data }) => this.#take(JSON.parse(data)));
-    socket.addEventListener("close", () => {
-      clearInterval(this.timer);
-      if (this.#socket === socket && this.robot) this.state.textContent = this.error ?? t("drive.ended");
-    });
     this.error = null;
-    socket.addEventListener("open", () => { this.timer = setInterval(() => this.#send(), FRAME_MS); });
+    // A socket of an earlier drive may close, or tell something, while the next one drives.
+    const isMine = () => this.#socket === socket;
+    let timer = null;
+    socket.addEventListener("message", ({ data }) => { if (isMine()) this.#take(JSON.parse(data)); });
+    socket.addEventListener("close", () => {
+      clearInterval(timer);
+      if (isMine()) this.state.textContent = this.error ?? t("drive.ended");
+    });
+    socket.addEventListener("open", () => { timer = setInterval(() => { if (isMine()) this.#send(); }, FRAME_MS); });
   }
 
   end() {
-    clearInterval(this.timer);
     this.#release();
     const socket = this.#socket;
     this.#socket = null;

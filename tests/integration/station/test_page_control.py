@@ -155,3 +155,30 @@ async def test_an_operator_stops_places_and_drives_a_robot() -> None:
         await check_stops(made, page)
         await check_pose(made, page)
         await check_drive(made, page)
+
+
+LATE_SOCKET = """() => {
+    const Real = WebSocket;
+    window.WebSocket = function () {
+        window.WebSocket = Real;
+        return rceFleet.late = Object.assign(new EventTarget(), { readyState: 1, send() {}, close() {} });
+    };
+}"""
+"""The next WebSocket does nothing but what is told to ``rceFleet.late``."""
+
+
+async def test_a_late_close_of_an_earlier_drive_stops_nothing() -> None:
+    """Neither does what its socket tells."""
+    async with site() as made, opened(made) as page:
+        await page.evaluate(LATE_SOCKET)
+        await page.evaluate("rceFleet.drive.begin('Robot1')")
+        await page.evaluate("void rceFleet.late.dispatchEvent(new Event('open'))")
+        await page.evaluate("rceFleet.drive.begin('Robot1')")
+        await page.locator("#drive-latency", has_text="round trip").wait_for()
+        refusal = """new MessageEvent("message", { data: '{"error": "it is driven"}' })"""
+        for event in (refusal, "new Event('close')"):
+            await page.evaluate(f"void rceFleet.late.dispatchEvent({event})")
+        assert await page.evaluate("rceFleet.drive.error") is None
+        await page.keyboard.down("ArrowUp")
+        await page.keyboard.down("Space")
+        await made.until(lambda: made.velocities and made.velocities[-1] == pytest.approx((0.35, 0.0)))
