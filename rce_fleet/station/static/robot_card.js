@@ -21,7 +21,7 @@ export class RobotCard {
     const robot = this.fleet.robots.get(this.fleet.selected);
     this.box.hidden = !robot || !this.steers;
     if (this.box.hidden) return;
-    const paused = robot.activity === "paused" || robot.mode === "paused";
+    const paused = ["paused", "stopped"].includes(robot.ownMode); // a robot of a paused fleet is not, and cannot be resumed
     const out = robot.activity === "out" || robot.mode === "out_of_service";
     const stops = [...(robot.emergency && !robot.undelivered ? [] : ["stop"]), ...(robot.emergency ? ["release"] : [])];
     const names = [...stops, paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));

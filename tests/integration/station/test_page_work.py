@@ -261,6 +261,21 @@ async def test_changes_of_a_zone_are_undone_one_by_one(tmp_path: Path) -> None:
         assert "zone1" not in zones
 
 
+async def test_a_paused_fleet_offers_no_resume_of_a_robot(tmp_path: Path) -> None:
+    """It would change nothing, and its undo would pause the robot for good."""
+    async with managed(tmp_path) as (made, client, page):
+        client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", mode="paused")
+        client.manager.dispatcher.update(time.time(), client.manager.facts)
+        paused = {**changes(robot("Robot1", cell=9, mode="paused")), "mode": "paused"}
+        made.feed.on_change(made.view.on_changes(paused))
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').activity === 'paused'")
+        await page.locator("tr[data-robot=Robot1]").click()
+        await page.locator("#robot-card button", has_text="Pause").click()
+        await page.locator("#robot-card button", has_text="Resume").click()
+        await page.locator("#robot-card button", has_text="Pause").wait_for()
+        assert client.manager.book.entry("Robot1").mode == "automatic"
+
+
 async def test_undo_of_a_mode_sets_the_one_before() -> None:
     """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
     async with site() as made:
