@@ -66,6 +66,7 @@ const VERTICES = [36, 9 * SIDES, 3];
 
 export class World3d {
   models = [];          // of the simulation: [name, x, y, yaw]
+  dragged = null;       // one of these where the pointer has it
   orbit = { x: 0, y: 0, distance: 10, turn: -Math.PI / 2, tilt: 0.9 };
   follows = true;       // show everything until the operator turns, zooms or pans
   #shown = false;
@@ -224,7 +225,8 @@ export class World3d {
       this.#add(arrows, x, y, 0, theta, 2 * radius, 2 * radius, height + 0.01, 0xffffff);
       if (robot.loads) this.#add(boxes, x - 0.35 * radius * Math.cos(theta), y - 0.35 * radius * Math.sin(theta), height, theta, radius, radius, radius, box);
     }
-    for (const [name, x, y, theta] of scene.replay ? [] : this.models) {
+    for (const model of scene.replay ? [] : this.models) {
+      const [name, x, y, theta] = model[0] === this.dragged?.[0] ? this.dragged : model;
       const [kind, width, depth] = this.fleet.things[name] ?? [];
       if (kind === "robot" || kind === "light") {
         this.#add(cylinders, x, y, 0, theta, 2.5 * radius, 2.5 * radius, 0.36 * radius, truth);

@@ -8,11 +8,12 @@ const REACH_M = 0.6;   // how near to something a pointer must be to take it
 const TURN = 0.008;    // radians for a pixel
 const PICKS = ["add_box", "add_person", "add_robot", "remove"];
 const STEMS = { add_box: "box", add_person: "person", add_robot: "Robot" };
+const DRAG_PX = 4;     // a pointer that moves less clicks
 const WALK_M = 0.5;    // a drag that is shorter puts a person who stands
 
 export class WorldPanel {
   #pointers = new Map();
-  #taken = null;       // the model that is dragged: [name, x, y, yaw]
+  #taken = null;       // what is dragged: {before: [name, x, y, yaw] at the press, from: [x, y] of the pointer}
   #pick = null;        // what the next click does: one of PICKS
   #from = null;        // where the person who is put in begins to walk
 
@@ -71,12 +72,12 @@ export class WorldPanel {
     if (this.#pick && !this.world.shown) this.show("both");
   }
 
-  #act(request) {
-    return this.operator.act(t("simulation"), () => ask("POST", "/simulation", request), this.#undo(request));
+  // before: what is moved, where it was: [name, x, y, yaw].
+  #act(request, before = null) {
+    return this.operator.act(t("simulation"), () => ask("POST", "/simulation", request), this.#undo(request, before));
   }
 
-  #undo({ action, name }) {
-    const before = this.fleet.models.find(([known]) => known === name);
+  #undo({ action, name }, before) {
     if (action in STEMS) return () => ask("POST", "/simulation", { action: "remove", name });
     if (action === "move" && before) return () => ask("POST", "/simulation", { action, name, x: before[1], y: before[2], yaw: before[3] });
     return null;
@@ -98,7 +99,8 @@ export class WorldPanel {
     if (!at || event.button !== 0 || event.shiftKey || !this.steers || this.#pointers.size > 1) return;
     if (this.#pick === "add_person") return (this.#from = at);
     if (this.#pick) return this.#use(at);
-    this.#taken = this.#nearest(at)?.slice() ?? null;
+    const model = this.#nearest(at);
+    this.#taken = model && { before: model, from: [event.clientX, event.clientY] };
   }
 
   // to: where a person walks to.
@@ -130,9 +132,9 @@ export class WorldPanel {
       this.#zoom(away(before) / away([event.clientX, event.clientY]));
     } else if (this.#taken) {
       const at = this.world.floorAt(event);
-      if (at) [this.#taken[1], this.#taken[2]] = at;
-      const shown = this.world.models.find(([name]) => name === this.#taken[0]);
-      if (shown && at) [shown[1], shown[2]] = at;
+      const { before: [name, , , yaw], from } = this.#taken;
+      const isDrag = this.world.dragged || Math.hypot(event.clientX - from[0], event.clientY - from[1]) >= DRAG_PX;
+      if (at && isDrag) this.world.dragged = [name, ...at, yaw];
     } else if (this.#from) return;
     else if (event.buttons & 2 || event.shiftKey) this.#pan(right, down);
     else {
@@ -152,17 +154,15 @@ export class WorldPanel {
       const to = this.world.floorAt(event);
       return this.#use(from, to && Math.hypot(to[0] - from[0], to[1] - from[1]) >= WALK_M ? to : null);
     }
-    if (taken && event.type === "pointerup") {
-      const [name, x, y, yaw] = taken;
-      const was = this.fleet.models.find(([known]) => known === name);
-      if (!was || this.world.floorAt(event)) this.#moveTo(name, x, y, yaw);
-    }
+    const { dragged } = this.world;
+    this.world.dragged = null;
+    if (taken && dragged && event.type === "pointerup" && this.world.floorAt(event)) this.#moveTo(dragged, taken.before);
   }
 
   // While the world is paused a robot is put at its start, and its localization is told.
-  async #moveTo(name, x, y, yaw) {
+  async #moveTo([name, x, y, yaw], before) {
     const isStart = this.fleet.isPaused && this.fleet.things[name]?.[0] === "robot" && this.fleet.robots.has(name);
-    if ((await this.#act({ action: "move", name, x, y, yaw })) === null || !isStart) return;
+    if ((await this.#act({ action: "move", name, x, y, yaw }, before)) === null || !isStart) return;
     await this.operator.act(t("action.localize.done", { robot: name }), () => ask("PUT", `/robots/${encodeURIComponent(name)}/pose`, { x, y, yaw }));
   }
 

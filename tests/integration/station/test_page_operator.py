@@ -426,3 +426,42 @@ async def test_the_world_is_drawn_in_three_dimensions() -> None:
         assert drawn[0] == [255, 255, 255, 255], "the arrow on top of the robot"
         assert drawn[1] != drawn[0]
         assert drawn[2] == pytest.approx([1.5, 1.5], abs=0.02)
+
+
+async def test_undo_of_a_drag_in_the_world_moves_it_back() -> None:
+    """A click moves nothing, and what is dragged is drawn where the pointer has it."""
+    async with site() as made:
+        page = await made.open()
+        asked: list[dict[str, Any]] = []
+
+        async def act(route: Route) -> None:
+            asked.append(json.loads(route.request.post_data or ""))
+            await route.fulfill(json={"message": "moved"})
+
+        await page.route("**/api/v1/simulation", act)
+        made.feed.pages.send("world", states_text([["Box1", 2.0, 2.0, 0.5]]))
+        await page.locator("#view-world").click()
+        await page.wait_for_function(
+            "rceFleet.world.models.length === 1 && rceFleet.world.canvas.width > 300"
+        )
+        canvas = page.locator("#world")
+        await canvas.scroll_into_view_if_needed()
+        box = await canvas.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        orbit = "Object.assign(rceFleet.world.orbit, { x: 2, y: 2, distance: 6, tilt: 1.5 })"
+        await page.evaluate(f"rceFleet.world.follows = false; {orbit}")
+        await page.mouse.move(x, y)
+        await page.mouse.down()
+        await page.mouse.move(x + 2, y)
+        await page.mouse.up()
+        await page.mouse.move(x, y)
+        await page.mouse.down()
+        await page.mouse.move(x + 60, y, steps=3)
+        assert await page.evaluate("rceFleet.world.dragged[1]") > 2.2
+        await page.mouse.up()
+        await page.locator("#message", has_text="moved").wait_for()
+        assert [(one["name"], one["x"] > 2.2, one["yaw"]) for one in asked] == [("Box1", True, 0.5)]
+        await page.locator("#undo:enabled").click()
+        await page.locator("#undo:disabled").wait_for()
+        assert asked[1:] == [{"action": "move", "name": "Box1", "x": 2.0, "y": 2.0, "yaw": 0.5}]
