@@ -14,7 +14,7 @@ export class Replay extends EventTarget {
   #at = null;        // the moment that is shown; null: live
   #playing = false;
   #robots = new Map();
-  #number = 0;
+  #isLoading = false;
 
   // say: (text, bad) => shows it
   constructor(view, fleet, say) {
@@ -53,32 +53,54 @@ export class Replay extends EventTarget {
 
   // The fleet of now must not look like a past one that could not be loaded.
   async #showOrGoLive(at) {
-    const number = this.#number + 1;
     try {
       await this.show(at);
     } catch (error) {
-      if (number !== this.#number) return;
       this.goLive();
       this.say(t("replay.failed", { reason: error.message }), true);
     }
   }
 
-  // Show a moment, seconds since 1970.
+  // Show a moment, seconds since 1970. While another one is loaded it is noted, and is the next one.
   async show(at) {
-    const number = ++this.#number;
     this.#at = at;
-    this.#tell();
-    const known = this.#frames.length && at >= this.#frames[0].time && at <= this.#frames[0].time + WINDOW_S - 1 && at >= this.shown;
-    if (!known) {
-      this.output.textContent = t("replay.loading");
-      const { frames } = await ask("GET", `/replay/${at}?seconds=${WINDOW_S}`);
-      if (number !== this.#number || this.#at === null) return;
-      this.#frames = frames;
-      this.#robots.clear();
-      this.taken = 0;
+    if (this.#isLoading) return this.#tell();
+    this.#isLoading = true;
+    try {
+      await this.#showNewest();
+    } finally {
+      this.#isLoading = false;
       this.#tell();
     }
-    this.#takeUntil(at);
+  }
+
+  // Until the newest moment that was asked for is shown: one load at a time, else each would take the place of one that is nearly there.
+  async #showNewest() {
+    let at = null;
+    while (this.#at !== null && this.#at !== at) {
+      at = this.#at;
+      try {
+        if (!this.#isLoaded(at)) await this.#load(at);
+      } catch (error) {
+        if (this.#at === at) throw error;
+        continue;
+      }
+      if (this.#at !== null) this.#takeUntil(at);
+    }
+  }
+
+  #isLoaded(at) {
+    const first = this.#frames[0]?.time;
+    return first !== undefined && at >= first && at <= first + WINDOW_S - 1 && at >= this.shown;
+  }
+
+  async #load(at) {
+    this.#tell();
+    const { frames } = await ask("GET", `/replay/${at}?seconds=${WINDOW_S}`);
+    if (this.#at === null) return;
+    this.#frames = frames;
+    this.#robots.clear();
+    this.taken = 0;
   }
 
   // Apply the frames up to a moment.
@@ -106,7 +128,7 @@ export class Replay extends EventTarget {
   }
 
   #tick() {
-    if (!this.#playing || this.#at === null) return;
+    if (!this.#playing || this.#at === null || this.#isLoading) return;
     const next = this.#at + 1;
     if (this.#span && next > this.#span.last + ASK_AGAIN_MS / 1000) return this.goLive();
     if (this.#span) this.slider.value = (STEPS * (next - this.#span.first)) / Math.max(1, this.#span.last - this.#span.first);
@@ -120,7 +142,6 @@ export class Replay extends EventTarget {
 
   goLive() {
     this.#at = null;
-    this.#number++;
     this.#playing = false;
     this.#frames = [];
     this.slider.value = STEPS;
@@ -134,7 +155,7 @@ export class Replay extends EventTarget {
     this.play.setAttribute("aria-pressed", this.#playing);
     this.play.disabled = this.#at === null;
     const text = this.#at === null ? "" : new Date(1000 * this.#at).toLocaleTimeString();
-    this.output.textContent = text;
+    this.output.textContent = text && this.#isLoading ? t("replay.loading") : text;
     this.slider.setAttribute("aria-valuetext", text || t("replay.live"));
     this.view.stage.classList.toggle("past", this.#at !== null);
     this.dispatchEvent(new Event("change"));
