@@ -182,19 +182,19 @@ async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
         await page.mouse.down()
         tell("Robot2", "silent")
         await other.wait_for()
-        async with page.expect_request("**/robots/Robot1/goal"):
+        async with page.expect_response("**/robots/Robot1/goal"):
             await page.mouse.up()
-        tell("Robot1", "unreachable")
+        tell("Robot1", "unreachable")  # again: the goal was removed
         await cancel.focus()
         tell("Robot2", "idle")
         await other.wait_for(state="detached")
-        async with page.expect_request("**/robots/Robot1/goal"):
+        async with page.expect_response("**/robots/Robot1/goal"):
             await page.keyboard.press("Enter")
         tell("Robot1", "unreachable")
         await cancel.focus()
         made.feed.on_control({"Robot1": "an operator"}, {})
         await page.locator("#attention-list button", has_text="Release").wait_for()
-        async with page.expect_request("**/robots/Robot1/goal"):
+        async with page.expect_response("**/robots/Robot1/goal"):
             await page.keyboard.press("Enter")
 
 
