@@ -213,17 +213,22 @@ async def test_bad_input_is_told_and_the_node_lives() -> None:
         )
 
 
-async def test_a_saved_map_is_loaded_again(tmp_path: Path) -> None:
-    """The map of one run: the next one localizes in it and leaves it as it is, or loads it on request."""
-    values: dict[str, Any] = {"map_file": str(tmp_path / "hall.npz"), "use_odom_topic": True}
+async def saved_map(values: dict[str, Any]) -> str:
+    """Map by a node of these parameters, and save the map; return what the node answered."""
     async with AsyncExitStack() as stack:
         world = World(stack)
         await world.start(values)
         robot = Robot(world.judge, "", ONE, 1)
         await robot.start()
         await world.drive(robot)
-        saved = (await world.call("/slam_graph/save_map")).message
-        assert "keyscans to" in saved
+        return str((await world.call("/slam_graph/save_map")).message)
+
+
+async def test_a_saved_map_is_loaded_again(tmp_path: Path) -> None:
+    """The map of one run: the next one localizes in it and leaves it as it is, or loads it on request."""
+    values: dict[str, Any] = {"map_file": str(tmp_path / "hall.npz"), "use_odom_topic": True}
+    saved = await saved_map(values)
+    assert "keyscans to" in saved
     async with AsyncExitStack() as stack:
         world = World(stack)
         await world.start({**values, "localize_only": True, "initial_pose": [0.0, 0.0, 0.0]})
@@ -250,13 +255,7 @@ async def test_without_its_map_the_node_does_not_map(tmp_path: Path) -> None:
     """With localize_only it publishes nothing before the map is loaded, and does not change it then."""
     file, other = tmp_path / "hall.npz", tmp_path / "elsewhere.npz"
     values: dict[str, Any] = {"map_file": str(file), "use_odom_topic": True}
-    async with AsyncExitStack() as stack:
-        world = World(stack)
-        await world.start(values)
-        robot = Robot(world.judge, "", ONE, 1)
-        await robot.start()
-        await world.drive(robot)
-        saved = (await world.call("/slam_graph/save_map")).message
+    saved = await saved_map(values)
     poses = load_graph(file).poses.copy()
     file.rename(other)
     async with AsyncExitStack() as stack:

@@ -245,16 +245,25 @@ async def test_a_port_in_use_is_named(tmp_path: Path) -> None:
         assert f"port {port}".encode() in said
 
 
+@asynccontextmanager
+async def empty_world() -> AsyncIterator[Simulation]:
+    """A simulation in this process, without robots until some are put in."""
+    said: list[str] = []
+    simulation = Simulation(Scene(), TypeRegistry(), said.append)
+    stop = asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(simulation.run(stop))
+        await until(lambda: "simulation ready: 0 robots, 0 boxes" in said, timeout=60, what="the world runs")
+        yield simulation
+        stop.set()
+
+
 async def test_a_robot_whose_port_is_taken_is_not_left_in_the_world(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It stood there without a node, and the request had no answer."""
-    said: list[str] = []
-    simulation = Simulation(Scene(), TypeRegistry(), said.append)
-    start, stop = RobotStart(id="R", at=(3.0, 3.0)), asyncio.Event()
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(simulation.run(stop))
-        await until(lambda: "simulation ready: 0 robots, 0 boxes" in said, timeout=60, what="the world runs")
+    start = RobotStart(id="R", at=(3.0, 3.0))
+    async with empty_world() as simulation:
         with socket.create_server(("", 0)) as taken, monkeypatch.context() as patch:
             port = taken.getsockname()[1]
             patch.setattr(simulation, "_next_port", lambda: port)
@@ -264,16 +273,11 @@ async def test_a_robot_whose_port_is_taken_is_not_left_in_the_world(
         await simulation.add_robot(start)
         await asyncio.gather(simulation.remove_robot("R"), simulation.remove_robot("R"))
         assert dict(simulation.world.robots) == {}
-        stop.set()
 
 
 async def test_a_robot_whose_request_is_cancelled_is_not_left_in_the_world() -> None:
-    said: list[str] = []
-    simulation = Simulation(Scene(), TypeRegistry(), said.append)
-    start, stop = RobotStart(id="R", at=(3.0, 3.0)), asyncio.Event()
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(simulation.run(stop))
-        await until(lambda: "simulation ready: 0 robots, 0 boxes" in said, timeout=60, what="the world runs")
+    start = RobotStart(id="R", at=(3.0, 3.0))
+    async with empty_world() as simulation:
         request = asyncio.create_task(simulation.add_robot(start))
         while "R" not in simulation.world.robots:  # its node starts then
             await asyncio.sleep(0)
@@ -282,7 +286,6 @@ async def test_a_robot_whose_request_is_cancelled_is_not_left_in_the_world() -> 
             await request
         assert dict(simulation.world.robots) == {}
         await simulation.add_robot(start)
-        stop.set()
 
 
 async def test_light_robots_bring_the_clock_to_a_core_that_runs() -> None:

@@ -252,49 +252,6 @@ class Noted(Wait):
         super().start(situation)
 
 
-def test_recovery_behaviors_are_tried_in_order_then_it_gives_up() -> None:
-    order: list[str] = []
-    robot = Robot(MoveBaseParameters(planner_timeout=1.0), [Noted("a", order), Noted("b", order)])
-    robot.plan = NO_WAY
-    robot.core.start(robot.now)
-    decision = robot.run(60.0)
-    assert order == ["a", "b"]
-    assert decision.ending is Ending.ABORTED
-    assert "recovery behaviors did not help" in decision.text
-    assert robot.core.recovered == 2
-
-
-def test_a_robot_without_valid_commands_recovers() -> None:
-    order: list[str] = []
-    robot = Robot(MoveBaseParameters(controller_timeout=1.0), [Noted("a", order)])
-    robot.obstacles = np.array([(1.25, y) for y in np.linspace(0, 2, 41)])
-    robot.core.start(robot.now)
-    robot.run(2.0)
-    assert order == ["a"]
-    robot.obstacles = np.empty((0, 2))
-    assert robot.run(30.0).ending is Ending.SUCCEEDED
-
-
-def test_an_oscillating_robot_recovers() -> None:
-    order: list[str] = []
-    robot = Robot(MoveBaseParameters(oscillation_timeout=3.0), [Noted("a", order)])
-    robot.core.start(robot.now)
-    for _ in range(40):
-        robot.pose = HERE  # it slips
-        robot.step()
-    assert order == ["a"]
-
-
-def test_recovery_can_be_turned_off() -> None:
-    order: list[str] = []
-    parameters = MoveBaseParameters(planner_timeout=1.0, recovery_behavior_enabled=False)
-    robot = Robot(parameters, [Noted("a", order)])
-    robot.plan = NO_WAY
-    robot.core.start(robot.now)
-    assert robot.run(10.0).ending is Ending.ABORTED
-    assert order == []
-
-
 # Behaviors
 
 
