@@ -38,6 +38,8 @@ _PARTS = 4
 """With limited time, the clock is read so often while each robot is planned alone."""
 KNOWN = 3
 """Goals of each robot that are known ahead, with the one that it drives to."""
+FARTHEST = int(UNREACHABLE) // 2
+"""Cost of a way over goals that are out of reach; with the way to the first goal the sum fits in an int32."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,5 +225,6 @@ class LifelongPlanner:
         total = 0
         for place in range(KNOWN - 1, 0, -1):
             self._base[robot, place] = total
-            total += int(self._table[robot * KNOWN + place, self._known[robot, place - 1]])
+            way = int(self._table[robot * KNOWN + place, self._known[robot, place - 1]])
+            total = min(total + way, FARTHEST)
         self._base[robot, 0] = total

@@ -131,3 +131,15 @@ def test_lifelong_robots_drive_by_learned_costs() -> None:
     assert sum(map(len, planner.goals)) > 20
     with pytest.raises(PlanningError, match="must have the same nodes and edges"):
         planner.guide(PlanningGraph.from_grid(GridMap(2, 2)))
+
+
+def test_later_goals_may_be_out_of_reach() -> None:
+    """Two of them in a row: the way over them is as far as can be said, and the first goal is reached."""
+    parts = PlanningGraph.from_edges(4, [Edge(0, 1), Edge(1, 0), Edge(2, 3), Edge(3, 2)])
+    goals = iter([1, 2, 0, 3] * 10)
+    planner = LifelongPlanner(
+        parts, np.array([0], np.int32), lambda *_: next(goals), settings=LifelongSettings(window=WINDOW)
+    )
+    for _ in range(2 * WINDOW):
+        planner.step()
+    assert planner.goals == [[1]]
