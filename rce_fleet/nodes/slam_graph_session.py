@@ -42,6 +42,8 @@ class SlamGraphSession:
         if len(parameters.initial_pose) == POSE_NUMBERS:
             self._start = np.array(parameters.initial_pose, np.float64)
         self._drawn: tuple[tuple[int, int], OccupancyMap] | None = None
+        self._unread = False
+        """Whether ``map_file`` is something that could not be loaded; it may still be of use to its owner."""
 
     @property
     def graph(self) -> KeyGraph:
@@ -118,14 +120,22 @@ class SlamGraphSession:
     def save(self) -> str:
         """Refine the map and write it to ``map_file``; return what was done.
 
+        A file that could not be loaded is not lost: it is renamed, with ``.unread`` behind its name.
+
         Raises:
             MapError: There is no file name, no scan yet, or the file cannot be written.
         """
         path = self._path()
         if len(self.graph) and not self._parameters.localize_only:
             self._mapper.finish()
+        if not self._unread:
+            save_graph(self.graph, path)
+            return f"wrote {len(self.graph)} keyscans to {path}"
+        unread = _put_aside(path) if len(self.graph) else None
         save_graph(self.graph, path)
-        return f"wrote {len(self.graph)} keyscans to {path}"
+        self._unread = False
+        text = f"wrote {len(self.graph)} keyscans to {path}"
+        return text if unread is None else f"{text}; the file that could not be loaded is {unread} now"
 
     def load(self) -> str:
         """Continue with the map in ``map_file``: all robots are placed anew; return what was done.
@@ -134,7 +144,12 @@ class SlamGraphSession:
             MapError: There is no file name, or the file cannot be used; the present map stays.
         """
         path = self._path()
-        graph = load_graph(path)
+        try:
+            graph = load_graph(path)
+        except MapError:
+            self._unread = path.is_file()
+            raise
+        self._unread = False
         self._mapper = GraphMapper(self._parameters.graph_parameters(), graph, bounded=True)
         self._localizers.clear()
         self._drawn = None
@@ -144,3 +159,19 @@ class SlamGraphSession:
         if not self._parameters.map_file:
             raise MapError("no file for the map: set the parameter ~map_file, such as /home/robot/floor1.npz")
         return Path(self._parameters.map_file).expanduser()
+
+
+def _put_aside(path: Path) -> Path | None:
+    """Rename a file that could not be loaded; return its new name, None if it is gone by now.
+
+    Raises:
+        MapError: It cannot be renamed.
+    """
+    unread = path.with_name(f"{path.name}.unread")
+    try:
+        path.replace(unread)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise MapError(f"{path} could not be loaded, and cannot be renamed: {error.strerror}") from error
+    return unread

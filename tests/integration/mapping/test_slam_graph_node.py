@@ -251,6 +251,17 @@ async def test_a_saved_map_is_loaded_again(tmp_path: Path) -> None:
         assert grid.data[row - 2 : row + 3, column].max() == 100
 
 
+async def test_a_map_that_cannot_be_loaded_is_kept(tmp_path: Path) -> None:
+    """A file that was cut short may be repaired by its owner: a new map does not replace it."""
+    file = tmp_path / "hall.npz"
+    file.write_bytes(b"PK half a map")
+    values: dict[str, Any] = {"map_file": str(file), "use_odom_topic": True, "load_map": True}
+    answer = await saved_map(values)
+    assert f"the file that could not be loaded is {file}.unread now" in answer
+    assert (tmp_path / "hall.npz.unread").read_bytes() == b"PK half a map"
+    assert len(load_graph(file))
+
+
 async def test_without_its_map_the_node_does_not_map(tmp_path: Path) -> None:
     """With localize_only it publishes nothing before the map is loaded, and does not change it then."""
     file, other = tmp_path / "hall.npz", tmp_path / "elsewhere.npz"
