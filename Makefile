@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
 	@echo "make test    everything: linters, types, docs, unit, integration and end-to-end tests"
-	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
+	@echo "make test-all  make test without linters and types        make test-quick  most unit tests"
 	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
 	@echo "make faults  kill, cut off and slow down masters and etcd; ARGS=\"--only kill --rounds 100 --seed 7\""
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
@@ -60,7 +60,7 @@ faults: install
 	PYTHONPATH=tests $(BIN)/python -m faults $(ARGS)
 
 test-quick: install
-	$(BIN)/python -m pytest -n logical --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)
+	$(BIN)/python -m pytest -n logical -m "not slow" --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)
 
 lint: packages
 	$(BIN)/ruff check .

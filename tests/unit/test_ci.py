@@ -72,6 +72,7 @@ def test_workers_have_ports_of_their_own() -> None:
     assert len(set(found)) == 500
 
 
+@pytest.mark.slow
 def test_a_parallel_run_makes_once_what_a_module_shares(tmp_path: Path) -> None:
     shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
     (tmp_path / "pytest.ini").write_text(f"[pytest]\npythonpath = {ROOT / 'tests'}\n")

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from support.sources import PACKAGES, ROOT, files, statements, text_of
 
 _BUILT_IN = frozenset(
@@ -65,6 +66,7 @@ def exceptions() -> set[str]:
     return found - _BUILT_IN
 
 
+@pytest.mark.slow
 def test_exceptions_end_in_error() -> None:
     found = exceptions()
     assert {"RosError", "NotFoundError", "TransitionError"} <= found

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
 from support.sources import PACKAGES, ROOT, files, statements
 
 _ROW = re.compile(r"^\| `(rce[\w.]*)` \|.*\| ([^|]*) \|$", re.MULTILINE)
@@ -67,6 +68,7 @@ def test_every_row_has_a_module() -> None:
     assert [name for name in table() if not is_module(name)] == []
 
 
+@pytest.mark.slow
 def test_no_import_leaves_the_table() -> None:
     rows = table()
     wrong = [

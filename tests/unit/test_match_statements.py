@@ -6,6 +6,7 @@ import ast
 from functools import cache
 from pathlib import Path
 
+import pytest
 from support.sources import PACKAGES, ROOT, files, statements, text_of
 
 OPEN = {
@@ -54,6 +55,7 @@ def _is_closed(match: ast.Match) -> bool:
     return isinstance(call, ast.Call) and getattr(call.func, "id", "") == "assert_never"
 
 
+@pytest.mark.slow
 def test_match_over_events_ends_with_assert_never() -> None:
     checked = 0
     wrong = []

@@ -222,6 +222,7 @@ def faults_of(path: str, text: str) -> list[str]:
     return faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tree", TREES)
 def test_no_banned_name_is_defined(tree: str) -> None:
     assert files(tree)

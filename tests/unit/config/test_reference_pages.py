@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 def test_reference_pages_are_current() -> None:
     run = subprocess.run(
         [sys.executable, "-m", "tools.reference", "--check"],

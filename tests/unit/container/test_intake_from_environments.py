@@ -110,6 +110,7 @@ def test_nodes_that_are_being_removed_stay() -> None:
     assert intake.PartFilter().whole(said, DESIRED) == said
 
 
+@pytest.mark.slow
 def test_little_is_kept_of_unknown_containers() -> None:
     """While a container's desired state is not known, patches together add no more than one report."""
     kept = intake.PartFilter()

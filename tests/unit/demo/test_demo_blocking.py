@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from support.fleet_states import fleet, robot
 
 from rce_fleet.demo.blocking import EFFECT_TIMEOUT, REPLAN_TIMEOUT, BlockAction, CellBlocker
@@ -88,6 +89,7 @@ RING = GridMap(rows=3, columns=5, blocked=frozenset({6, 7, 8}))
 """One lane around a wall; with a cell of it blocked, robots cannot pass one another any more."""
 
 
+@pytest.mark.slow
 def test_cell_needed_to_pass_each_other_is_not_blocked() -> None:
     block = CellBlocker(RING, {"a": 14, "b": 0})
     driving = fleet(

@@ -45,6 +45,7 @@ def test_the_example_is_for_the_demos_floor() -> None:
     assert any(lane.speed for lane in lanes.lanes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_robots_start_on_lanes_and_can_reach_their_goals(seed: int) -> None:
     lanes = found(EXAMPLE)
@@ -67,6 +68,7 @@ def test_the_planner_gets_the_lanes_themselves() -> None:
     assert set(without.goal_cells) == set(FLOOR.free)
 
 
+@pytest.mark.slow
 def test_lanes_that_lead_away_are_no_goals(tmp_path: Path) -> None:
     """A robot could not come back from there, or not get there."""
     file = tmp_path / "lanes.yaml"

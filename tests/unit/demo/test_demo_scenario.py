@@ -16,6 +16,7 @@ MAP = "type octile\nheight 2\nwidth 3\nmap\n...\n.@.\n"
 SCEN = "version 1\n0\tm.map\t3\t2\t0\t0\t2\t1\t3\n0\tm.map\t3\t2\t2\t0\t0\t1\t3\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robots", [1, 3, 8])
 @pytest.mark.parametrize("seed", range(25))
 def test_some_robot_has_a_long_way(robots: int, seed: int) -> None:

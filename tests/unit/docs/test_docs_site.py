@@ -38,6 +38,7 @@ def test_a_site_without_broken_links_is_built(tmp_path: Path) -> None:
     assert (tmp_path / "site/index.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "broken",
     ["[page](nothing.md)", "[part](other.md#no-part)", "[`name`][no.such.name]", "[file](../no/file.py)"],

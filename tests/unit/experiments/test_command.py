@@ -53,6 +53,7 @@ def test_as_many_runs_are_made_as_were_begun(data: Path) -> None:
     assert "2 set-ups 22 runs" in invoke("--plan")[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "text"),
     [

@@ -99,6 +99,7 @@ class SlowBench:
         pass
 
 
+@pytest.mark.slow
 async def test_runs_are_read_at_the_same_times(tmp_path: Path) -> None:
     """Each value over time has a column: one that is read at 1.1 s is not compared with one at 1.0 s."""
     streaming = Streaming(cast("Bench", SlowBench()), tmp_path / "control.json", [], [])

@@ -73,6 +73,7 @@ def test_log_of_a_node_is_printed(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, TEXT), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", [0, node_log.UNAVAILABLE])
 def test_nothing_is_printed_while_the_engine_cannot_answer(tmp_path: Path, status: int) -> None:
     with engine(status) as port:

@@ -71,6 +71,7 @@ def test_a_lost_robot_found_in_the_way_stops_others(
     arrive(fleet)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("cell", "up"), [(4, 0.0), (4, 0.4), (6, 0.0), (5, 0.3)])
 def test_a_silent_robot_pushed_into_the_way_stops_others(
@@ -91,6 +92,7 @@ def test_a_silent_robot_pushed_into_the_way_stops_others(
     arrive(fleet)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("cell", "place"), [(6, (0.0, 0.0)), (6, (0.3, 0.0)), (6, (-0.2, 0.4)), (7, (-0.45, 0.0))]

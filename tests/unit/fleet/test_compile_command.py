@@ -125,12 +125,14 @@ def test_only_what_is_new_is_copied(tmp_path: Path) -> None:
     assert copies == {"old.nbc": "target", "new.nbi": "source", "first.nbc": "source"}
 
 
+@pytest.mark.slow
 def test_a_process_with_its_own_folder_compiles_nothing(cache: Cache, tmp_path: Path) -> None:
     assert cache.run("install") == (0, 12)
     assert cache.run("use", tmp_path / "own") == (1, 12)
     assert cache.run("use") == (1, 12)
 
 
+@pytest.mark.slow
 def test_loading_says_whether_the_cache_has_the_loops(cache: Cache, tmp_path: Path) -> None:
     assert not cache.load(tmp_path / "empty")
     assert cache.run("use", tmp_path / "own") == (0, 12)
@@ -139,6 +141,7 @@ def test_loading_says_whether_the_cache_has_the_loops(cache: Cache, tmp_path: Pa
     assert cache.load(tmp_path / "another"), "as a container does with what rce compile made"
 
 
+@pytest.mark.slow
 def test_a_changed_helper_is_compiled_anew(cache: Cache) -> None:
     """numba itself looks at the file of the loop only."""
     assert cache.run("install") == (0, 12)

@@ -12,6 +12,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.scenario import given_scenario, make_scenario, midway_cell, solvable, spread_scenario
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(seed=st.integers(0, 2**32), robots=st.integers(1, 12))
 def test_all_robots_can_reach_their_goals(seed: int, robots: int) -> None:
@@ -41,6 +42,7 @@ def test_a_map_in_parts_is_used_in_its_largest_part_only() -> None:
     assert min(*scenario.starts, *scenario.goals, *scenario.boxes) >= 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_boxes_on_one_lane_leave_robots_room_to_pass(seed: int) -> None:
     ring = GridMap(3, 6, blocked=frozenset({7, 8, 9, 10}))
@@ -49,6 +51,7 @@ def test_boxes_on_one_lane_leave_robots_room_to_pass(seed: int) -> None:
     assert solvable(ring.with_blocked(ring.blocked | scenario.boxes), scenario.starts, scenario.goals)
 
 
+@pytest.mark.slow
 def test_robots_that_can_never_pass_are_not_drawn() -> None:
     scenario = make_scenario(GridMap(1, 9), 3, seed=1)
     order = sorted(range(3), key=lambda robot: scenario.starts[robot])

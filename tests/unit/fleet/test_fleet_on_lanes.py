@@ -49,6 +49,7 @@ def on_lanes(lanes: LaneGraph, settings: FleetSettings) -> FleetPlanner:
     return FleetPlanner(lanes.restrict(FLOOR), settings, lanes=lanes)
 
 
+@pytest.mark.slow
 def test_robots_never_drive_against_a_lane(
     make_fleet: type[SimulatedClients], settings: FleetSettings
 ) -> None:

@@ -41,6 +41,7 @@ def connected_map(rng: Random, boxes: int) -> GridMap:
             return grid
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 @example(seed=332619, count=7)  # of two robots in a dead end, each comes out for the other, again and again
@@ -70,6 +71,7 @@ def test_every_robot_arrives_within_its_own_cells(
     }
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 @example(seed=2271760180, count=1)  # a client begins behind a stop that is newer than all goals
@@ -94,6 +96,7 @@ def test_robots_stop_and_arrive_though_a_clock_jumps(
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8), carries=st.booleans())
 @example(seed=1523888, count=2, carries=False)  # signs of life come before the poses of a silent time
@@ -125,6 +128,7 @@ def test_indexes_equal_a_recomputation_whatever_happens(
         fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(2, 6))
 @example(seed=126, count=3)  # a robot that leaves the cell of another has its path through that cell
@@ -170,6 +174,7 @@ def crowd(rng: Random, grid: GridMap, count: int) -> list[tuple[float, float]]:
     return places
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(2, 8))
 @example(seed=100000, count=7)  # the pose of a robot jumps while it is stopping between two cells
@@ -297,6 +302,7 @@ def put_zone(fleet: SimulatedClients, rng: Random) -> None:
     fleet.ask(ZonesSet((zone,) if cells and rng.random() < 0.7 else (), remove=(rng.choice("abc"),)))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("data")
 @pytest.mark.parametrize("count", [4, 12])
 def test_robots_drive_on_a_benchmark_map(

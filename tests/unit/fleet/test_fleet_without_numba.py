@@ -42,6 +42,7 @@ def scenario(folder: Path, name: str, *, short: bool = False) -> tuple[GridMap, 
     return grid, [row.start for row in rows], [row.goal for row in rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["random-32-32-20", "warehouse-10-20-10-2-1"])
 @pytest.mark.parametrize("rotations", [True, False])
 def test_plan_for_fifty_robots_has_no_conflict(rce_data: Path, name: str, *, rotations: bool) -> None:
@@ -55,6 +56,7 @@ def test_plan_for_fifty_robots_has_no_conflict(rce_data: Path, name: str, *, rot
     assert np.array_equal(joint.cells[-1], goals)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_fifty_robots_reach_their_goals(rce_data: Path, make_fleet: type[SimulatedClients]) -> None:
     """Planner, move clients and robots; after each step the fleet checks that no two robots touch."""

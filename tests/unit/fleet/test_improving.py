@@ -76,6 +76,7 @@ class Crowd(PlannerHarness):
         return sum(self.planner.state.ledger.account(robot).steps[-1] for robot in self.planner.state.robots)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_better_paths_keep_granted_cells_and_end_at_goals(seed: int) -> None:
     crowd = Crowd(seed)
@@ -94,6 +95,7 @@ def test_better_paths_keep_granted_cells_and_end_at_goals(seed: int) -> None:
     assert crowd.last_steps() < before
 
 
+@pytest.mark.slow
 def test_better_paths_are_not_looked_for_again_in_vain() -> None:
     """The search is repeated while it finds something; then nothing is done until paths change."""
     crowd = Crowd()
@@ -120,6 +122,7 @@ def test_nothing_is_granted_while_better_paths_are_looked_for() -> None:
     assert crowd.sent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["a blocked cell", "a removed robot", "a new goal"])
 def test_better_paths_for_another_state_are_not_used(what: str) -> None:
     crowd = Crowd()
@@ -140,6 +143,7 @@ def test_better_paths_for_another_state_are_not_used(what: str) -> None:
     assert versions == {robot: ledger.version(robot) for robot in crowd.planner.state.robots}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [replace(SETTINGS, improve_seconds=0), replace(SETTINGS, planner="dijkstra")]
 )
@@ -149,6 +153,7 @@ def test_better_paths_are_off(settings: FleetSettings) -> None:
     assert not any(crowd.ask() for _ in range(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_robots_with_better_paths_arrive(make_fleet: type[SimulatedClients], seed: int) -> None:
     """Messages are late and get lost, and so are plans: no collision, and everyone arrives."""

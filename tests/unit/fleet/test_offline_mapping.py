@@ -53,6 +53,7 @@ def names(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_a_log_becomes_a_map_and_a_trajectory(tmp_path: Path) -> None:
     true, records = drive()
     write_carmen(tmp_path / "run.log", records)
@@ -81,6 +82,7 @@ def test_a_faulty_row_of_a_trajectory_is_told_with_its_line(tmp_path: Path, row:
         read_trajectory(path)
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_a_map(tmp_path: Path) -> None:
     true, records = drive(laser=FRONT)
     write_bag(tmp_path / "run.bag", records, scan="/front/scan")
@@ -132,6 +134,7 @@ def test_a_truncated_bag_is_refused(tmp_path: Path) -> None:
         read_log(tmp_path / "run.bag")
 
 
+@pytest.mark.slow
 def test_a_damaged_bag_is_read_as_far_as_possible_or_refused(tmp_path: Path) -> None:
     """Half of these damages ended ``rce map`` with a traceback."""
     log = tmp_path / "run.bag"
@@ -242,6 +245,7 @@ def test_ctrl_c_leaves_the_former_result(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "map.yaml").read_text() == "former"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [("--initial-pose", "4.7,3.2,-1.5708"), ("--global",)])
 def test_a_log_is_localized_on_a_map(tmp_path: Path, start: tuple[str, ...]) -> None:
     true, records = drive()

@@ -42,6 +42,7 @@ def run(
 QUICK = FilterParameters(particles=3, linear_update=0.2, angular_update=0.2, skip=1)
 
 
+@pytest.mark.slow
 def test_a_drive_is_mapped_better_than_by_odometry() -> None:
     true, mapper = run(QUICK)
     _, records = drive()
@@ -58,6 +59,7 @@ def test_a_drive_is_mapped_better_than_by_odometry() -> None:
     assert 300 < drawn.occupied.sum() < 900
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_map() -> None:
     first, second, other = (run(QUICK, seed, number=20)[1] for seed in (1, 1, 2))
     assert (first.trajectory() == second.trajectory()).all()
@@ -77,6 +79,7 @@ def test_the_parameters_of_the_paper_give_a_map_by_odometry() -> None:
         mapper.finish()
 
 
+@pytest.mark.slow
 def test_a_map_can_begin_at_a_given_pose() -> None:
     """Everything is as if the map was moved there; cells differ where the grid falls otherwise."""
     start = (3.0, -2.0, 0.5)
@@ -88,6 +91,7 @@ def test_a_map_can_begin_at_a_given_pose() -> None:
     assert map_of(found.store, found.best).values_at(compose(np.array(start), true)[:, :2]).max() == 0
 
 
+@pytest.mark.slow
 def test_scans_are_used_after_way_turn_or_time() -> None:
     _, records = drive()
     for parameters, used in (
@@ -158,6 +162,7 @@ def test_ancestry_follows_resampled_particles() -> None:
     assert ways.path(1)[:, 0].tolist() == [0, 7]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("resample_threshold", [0.0, 1.1])
 def test_a_filter_without_the_way_keeps_one_entry(resample_threshold: float) -> None:
     """A node runs for months; the map is the same as with the way."""

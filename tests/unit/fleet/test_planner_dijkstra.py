@@ -66,6 +66,7 @@ def test_deadlocks_are_resolved_if_asked(
     assert all(not robot.reason for robot in fleet.planner.snapshot().robots)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 def test_all_arrive_whatever_meets(make_fleet: type[SimulatedClients], seed: int, count: int) -> None:

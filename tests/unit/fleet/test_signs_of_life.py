@@ -93,6 +93,7 @@ def test_a_robot_without_a_pose_says_what_it_waits_for() -> None:
     assert client.state() is RobotState.IDLE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_robots_that_send_no_pose_at_rest_arrive(make_fleet: type[SimulatedClients], seed: int) -> None:
     """Poses come each 0.2 m only, so the last cell is reached by the feedback of navigation."""

@@ -140,6 +140,7 @@ class SimulatedFleet:
             self.plan(CellBlocked(cell))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2)])
 def test_robots_reach_goals_without_collisions(robots: int, seed: int) -> None:
     check_run(SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed))
@@ -165,6 +166,7 @@ def test_robots_drive_slowly_in_a_slow_zone() -> None:
     assert top[False] > 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.needs("data")
 def test_four_robots_drive_on_a_benchmark_map(rce_data: Path) -> None:
     grid = read_map(rce_data / "maps" / "random-32-32-20.map")

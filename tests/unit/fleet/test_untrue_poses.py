@@ -76,6 +76,7 @@ def test_a_robot_that_jumps_to_and_fro_is_not_driven(make_fleet: type[SimulatedC
         assert robot(fleet).state in (RobotState.STOPPING, RobotState.SILENT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [nan, inf, -inf, 1.7e308, -1e308, 1.001e9])
 @pytest.mark.parametrize("is_mute", [False, True])
 def test_a_place_that_no_robot_can_be_at_is_ignored(

@@ -250,6 +250,7 @@ def test_costs_are_shared_by_robots_with_the_same_zones() -> None:
     assert book.costs_of("A") == {1: 3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -294,6 +295,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
 def test_moves_are_closed_for_one_robot_only(
     make_fleet: type[SimulatedClients], settings: FleetSettings

@@ -189,6 +189,7 @@ def drains_a_battery(floor: Floor, _near1: Task, _near2: Task) -> None:
     floor.facts.robots["Robot1"].battery = 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "happens",
     [

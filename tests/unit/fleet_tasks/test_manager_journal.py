@@ -134,6 +134,7 @@ async def test_an_event_that_cannot_be_written_is_rolled_back(client: ManagerCli
     assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
 
 
+@pytest.mark.slow
 async def test_a_journal_that_cannot_be_read_is_read_later(
     client: ManagerClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:

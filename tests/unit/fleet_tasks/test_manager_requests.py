@@ -78,6 +78,7 @@ async def test_no_robot_is_denied_before_the_planner_has_told_its_robots(
     assert (await client.ask(method, path, body))[0] == 404
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "path", "body", "status"),
     [

@@ -231,6 +231,7 @@ async def test_events_of_a_large_batch_are_published_in_slices(tmp_path: Path) -
     assert [event["number"] for events in published for event in events] == list(range(1, 251))
 
 
+@pytest.mark.slow
 def test_libraries_are_not_loaded_in_the_event_loop(tmp_path: Path) -> None:
     """scipy takes more than a second to load; a thread does it before the first task is given."""
     command = [sys.executable, "-c", LOADING, str(tmp_path / "j.sqlite")]

@@ -132,6 +132,7 @@ def problems(draw: st.DrawFn) -> RoutingProblem:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(problems())
 def test_routes_are_allowed_and_better(problem: RoutingProblem) -> None:
@@ -148,6 +149,7 @@ def test_routes_are_allowed_and_better(problem: RoutingProblem) -> None:
     assert cost(problem, routes) < inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_few_tasks_get_the_best_routes(seed: int) -> None:
     """Compared with all routes that there are."""

@@ -195,6 +195,7 @@ def no_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(travel_module, "CELLS_PER_STEP", 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 2**32))
 def test_estimates_know_exactly_where_no_way_leads(seed: int) -> None:

@@ -82,6 +82,7 @@ def filtered(parameters: AmclParameters = SMALL, grid: OccupancyMap = GRID, seed
     return amcl
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odometry", list(OdometryModel))
 @pytest.mark.parametrize("laser", [LaserModel.LIKELIHOOD_FIELD, LaserModel.LIKELIHOOD_FIELD_PROB])
 def test_all_models_follow_the_robot(odometry: OdometryModel, laser: LaserModel) -> None:

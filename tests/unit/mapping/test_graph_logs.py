@@ -14,6 +14,7 @@ from rce_fleet.mapping.logs import read_carmen
 from rce_fleet.mapping.trajectory import read_trajectory
 
 
+@pytest.mark.slow
 @pytest.mark.needs("data")
 @pytest.mark.parametrize(("name", "count", "step"), [("intel", 80, 1), ("freiburg-079", 200, 6)])
 def test_piece_of_a_real_log_is_mapped(rce_data: Path, name: str, count: int, step: int) -> None:

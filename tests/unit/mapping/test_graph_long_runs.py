@@ -37,6 +37,7 @@ def jumping(log: list[LaserRecord], at: int, jump: tuple[float, float, float]) -
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump", [(2.0, 0.0, 0.0), (-3.0, 3.0, 0.0), (0.0, 0.0, 2.5), (90.0, 0.0, 1.0)])
 def test_odometry_that_jumps_moves_no_scan(jump: tuple[float, float, float]) -> None:
     truth = drive(WAY)
@@ -126,6 +127,7 @@ def test_oldest_and_newest_keyscans_of_a_place_stay() -> None:
     assert pruning.surplus(graph, (3,)) == [2, 4, 5]
 
 
+@pytest.mark.slow
 def test_graph_of_a_known_place_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapper_module, "PRUNE_EVERY", 10)
     monkeypatch.setattr(mapper_module, "RECENT", 15)
@@ -158,6 +160,7 @@ OTHER = [
 """A building whose south corridor begins as that of ``RING`` does, and differs from there on."""
 
 
+@pytest.mark.slow
 def test_join_that_later_scans_contradict_is_undone() -> None:
     first, second = drive(RING_WAY[:5]), drive([(1.5, 8), (1.5, 1.5), (6.5, 1.6), (12.5, 2), (12.5, 8)])
     mapper = GraphMapper()

@@ -129,6 +129,7 @@ def worst_error(trajectory: Poses, truth: Poses) -> float:
     return float(np.hypot(error[:, 0], error[:, 1]).max())
 
 
+@pytest.mark.slow
 def test_drive_around_block_closes_loops(driven: tuple[GraphMapper, Poses]) -> None:
     mapper, truth = driven
     assert mapper.loop_closures >= 5

@@ -38,6 +38,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[KeyGraph, Path, Pos
     return mapper.graph, path, truth[0]
 
 
+@pytest.mark.slow
 def test_robots_are_joined_where_they_meet() -> None:
     first, second = drive(RING_WAY[:4]), drive([(11.5, 8.5), (1.6, 8.2), (1.4, 1.6), (6, 1.5)])
     mapper = GraphMapper()
@@ -54,6 +55,7 @@ def test_robots_are_joined_where_they_meet() -> None:
         assert np.hypot(error[:, 0], error[:, 1]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_robots_that_do_not_meet_stay_apart() -> None:
     other = [
         *polyline((50, 0), (57, 0), (57, 3), (66, 3), (66, 8), (61, 8), (61, 11), (50, 11), closed=True),
@@ -70,6 +72,7 @@ def test_robots_that_do_not_meet_stay_apart() -> None:
     assert not mapper.is_joined("R2")
 
 
+@pytest.mark.slow
 def test_saved_map_is_the_same(saved: tuple[KeyGraph, Path, Poses]) -> None:
     graph, path, _ = saved
     again = load_graph(path)
@@ -97,6 +100,7 @@ def test_loaded_map_is_continued_from_known_start(saved: tuple[KeyGraph, Path, P
     assert np.hypot(*error[:2]) < 0.05
 
 
+@pytest.mark.slow
 def test_loaded_map_is_continued_from_unknown_start(saved: tuple[KeyGraph, Path, Poses]) -> None:
     _, path, origin = saved
     mapper = GraphMapper(graph=load_graph(path))
@@ -108,6 +112,7 @@ def test_loaded_map_is_continued_from_unknown_start(saved: tuple[KeyGraph, Path,
     assert np.hypot(*error[:2]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_known", [True, False])
 def test_robot_is_localized_in_saved_map(saved: tuple[KeyGraph, Path, Poses], is_known: bool) -> None:
     _, path, origin = saved
@@ -141,6 +146,7 @@ def test_scans_without_returns_follow_odometry() -> None:
     assert mapper.trajectory()[:, 0] == pytest.approx(0.1 * np.arange(30), abs=0.02)
 
 
+@pytest.mark.slow
 def test_gap_in_log_is_bridged() -> None:
     """A robot that sends nothing on a part of its way is placed again by its odometry and the map."""
     truth = drive(RING_WAY)
@@ -153,6 +159,7 @@ def test_gap_in_log_is_bridged() -> None:
     assert worst_error(mapper.trajectory(), truth[kept]) < 0.3
 
 
+@pytest.mark.slow
 def test_lost_robot_is_found_on_its_own_map() -> None:
     """After a gap that odometry cannot bridge the robot begins a new part, which loops join again."""
     truth = drive([*RING_WAY, (12.3, 1.8), (12.3, 5)])

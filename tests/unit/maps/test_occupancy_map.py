@@ -76,6 +76,7 @@ def test_distances_are_those_of_brute_force() -> None:
     assert (distance_field(OccupancyMap(np.zeros((2, 3), np.int8)), 2.0) == 2.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reach", [0, 1, 3, 25, 300])
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3])
 def test_squares_computed_in_bands_are_those_of_the_whole(

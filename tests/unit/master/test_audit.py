@@ -138,6 +138,7 @@ def test_flood_of_different_records_leaves_others(
     assert len(found) <= BURST + 2 * MAX_KINDS + 3
 
 
+@pytest.mark.slow
 def test_refusals_from_too_many_addresses_are_counted(tmp_path: Path) -> None:
     log = AuditLog(tmp_path, Clock())
     log.add("bob", "log_in")

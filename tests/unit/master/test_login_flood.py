@@ -106,6 +106,7 @@ async def test_many_addresses_share_what_there_is(door: Door) -> None:
     assert door.hasher.verified.index(RIGHT) <= begun + CROWDS + HASH_WORKERS
 
 
+@pytest.mark.slow
 async def test_wrong_passwords_checked_together_are_counted(door: Door) -> None:
     """Wrong passwords that wait together are counted all the same."""
     door.hasher.go.clear()
@@ -120,6 +121,7 @@ async def test_wrong_passwords_checked_together_are_counted(door: Door) -> None:
     assert door.outcomes.count(WrongCredentialsError) == 11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", ["unknown", "zoe"])
 async def test_flood_delays_first_login_by_few_checks(door: Door, names: str) -> None:
     """A fleet and its attacker behind one router: the queue is full of guesses, and of nothing else."""

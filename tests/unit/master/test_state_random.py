@@ -348,7 +348,7 @@ class Histories(RuleBasedStateMachine):
 Histories.TestCase.settings = settings(
     max_examples=30, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
 )
-TestHistories = pytest.mark.timeout(120)(Histories.TestCase)
+TestHistories = pytest.mark.slow(pytest.mark.timeout(120)(Histories.TestCase))
 
 
 class SlicedHistories(Histories):

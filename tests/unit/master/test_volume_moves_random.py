@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.moving_volumes import JOURNAL, KEPT, Moving
@@ -33,6 +34,7 @@ STEPS = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(STEPS, st.booleans())
 @settings(max_examples=150, deadline=None)
 def test_kills_in_any_phase_lose_and_run_nothing_twice(steps: list[str], kept: bool) -> None:

@@ -12,6 +12,7 @@ from benchmarks.localization.runs import CAMERA, SHIPPED, drive
 from benchmarks.navigation.drive import run
 
 
+@pytest.mark.slow
 def test_a_robot_reaches_its_goal_among_walkers() -> None:
     result = run(5010)
     assert result.reached, result.text

@@ -312,6 +312,7 @@ def test_a_lost_robot_ends_nothing() -> None:
     assert explorer.update(search_of(CLOSED), 3.0, 3.0) is Action.DONE
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from((1.0, 2.0, inf)))
 def test_every_floor_is_explored_to_the_end(seed: int, reach: float) -> None:

@@ -103,6 +103,7 @@ def test_the_compiled_field_equals_the_numpy_one(cells: list[tuple[int, int, int
     assert (spread.compile()(steps, goal, stop) == spread.numpy(steps, goal, stop)).all()
 
 
+@pytest.mark.slow
 @given(costmaps, places, places, st.sampled_from((0.0, 0.35)), st.integers(0, 40))
 @settings(max_examples=60)
 def test_a_growing_window_finds_what_the_whole_map_has(

@@ -74,6 +74,7 @@ def test_the_robot_reaches_the_goal_with_its_heading(sampling: str) -> None:
     assert abs(wrap(pose.yaw - pi)) <= limits.yaw_goal_tolerance
 
 
+@pytest.mark.slow
 @given(
     st.floats(-pi, pi),
     st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=3),

@@ -6,6 +6,7 @@ import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.amcl import Amcl
@@ -79,6 +80,7 @@ def test_a_costmap_keeps_five_bytes_for_each_cell() -> None:
     assert most < 16
 
 
+@pytest.mark.slow
 def test_a_plan_over_a_whole_map_takes_a_quarter_of_a_kilobyte_for_each_cell() -> None:
     """In numpy, most of it for scipy's edges; the compiled loop takes 17 bytes."""
     costmap = LayeredCostmap(CostmapParameters(static_layer=StaticLayerParameters()), Footprint(0.2))

@@ -99,6 +99,7 @@ def test_some_things_stay_at_home(package: Path) -> None:
     assert "line 2" in fault(package)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("manifest", "text"),
     [

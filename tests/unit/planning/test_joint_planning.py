@@ -103,6 +103,7 @@ def test_time_that_is_left_goes_into_the_search_for_a_first_plan() -> None:
         planner.plan(replace(problem, seconds=120.0))
 
 
+@pytest.mark.slow
 def test_improvement_lowers_the_cost() -> None:
     cells = SHELVES.free
     graph = PlanningGraph.from_grid(SHELVES)

@@ -98,6 +98,7 @@ def drawn(seed: int, count: int, share: float, side: int) -> tuple[GridMap, list
     return grid, rng.sample(part, count), rng.sample(part, count)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
@@ -125,6 +126,7 @@ def test_motion_plans_keep_rules_and_expected_times(
         assert execution_times(joint.cells, 7, motion).tolist() == simulate(joint, 7, motion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.15])
 def test_plans_with_turns_counted_are_carried_out_sooner(share: float) -> None:
     """On average over random maps, by the independent simulation, by at least a tenth."""

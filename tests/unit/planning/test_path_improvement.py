@@ -33,6 +33,7 @@ def arrivals(routes: list[Route]) -> list[float]:
     return [route[-1][1] if route else 0.0 for route in routes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_better_paths_arrive_earlier_and_in_no_circle(seed: int) -> None:
     """Robots drive in any order; who does not arrive waits for one that is in its goal."""
@@ -49,6 +50,7 @@ def test_better_paths_arrive_earlier_and_in_no_circle(seed: int) -> None:
         ]
 
 
+@pytest.mark.slow
 def test_urgent_robots_arrive_no_later() -> None:
     later = dict[bool, int]()
     for is_urgent in (False, True):

@@ -74,6 +74,7 @@ def test_a_robot_is_not_pulled_into_a_forbidden_cell(
     assert rows[1].tolist() == [4, entered]
 
 
+@pytest.mark.slow
 def test_a_long_way_on_a_large_map_takes_little_memory() -> None:
     """A table of who is where and when has four bytes for each step and node, even with one robot."""
     grid = GridMap(220, 220)

@@ -331,6 +331,7 @@ VALUES = st.recursive(
 MESSAGES = st.dictionaries(KEYS, VALUES, max_size=4) | st.binary(max_size=40)
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(st.lists(MESSAGES, min_size=1, max_size=8), st.randoms(use_true_random=False))
 def test_frames_of_many_messages_in_any_order(sent: list[Any], random: Random) -> None:

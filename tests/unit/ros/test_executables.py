@@ -66,6 +66,7 @@ def test_search_of_a_huge_folder_ends(tmp_path: Path, monkeypatch: pytest.Monkey
     assert ExecutableFinder().find(tmp_path, "node") is None
 
 
+@pytest.mark.slow
 @pytest.mark.needs("roslaunch")
 @pytest.mark.parametrize("place", ["cfg", "src/pkg/tools", "launch/.hidden", "lib/pkg"])
 def test_same_files_are_found_as_by_roslaunch(tmp_path: Path, place: str) -> None:

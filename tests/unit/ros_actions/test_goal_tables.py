@@ -42,6 +42,7 @@ def test_every_path_is_possible_step_by_step() -> None:
         assert steps.issuperset(pairwise(path)), (comm, path)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("actionlib")
 def test_the_client_table_is_that_of_rospy() -> None:
     program = (

@@ -147,6 +147,7 @@ def test_a_package_that_is_added_after_a_miss_is_found(tmp_path: Path) -> None:
     assert index.find("p").path == added
 
 
+@pytest.mark.slow
 def test_a_large_tree_is_looked_at_seldom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten thousand lookups cost one search and few checks, by a clock that only the checks move."""
     for number in range(package_tree.SMALL + 1):

@@ -109,6 +109,7 @@ async def test_a_robot_that_is_away_is_stopped_when_it_comes(names: list[str] | 
         await until(lambda: robots.last("Robot1") is True)
 
 
+@pytest.mark.slow
 async def test_a_stop_that_is_not_delivered_is_told_until_it_is() -> None:
     robots = Robots("Robot1", "Robot2")
     told: list[list[str]] = []
@@ -151,6 +152,7 @@ async def test_a_stop_that_cannot_be_sent_again_ends_nothing() -> None:
         await until(lambda: control.undelivered == [])
 
 
+@pytest.mark.slow
 async def test_a_release_reaches_a_robot_that_comes_later() -> None:
     robots = Robots("Robot1")
     control = RobotControl(robots, lambda: ["Robot1"])

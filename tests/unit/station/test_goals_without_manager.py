@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
+import pytest
 from aiohttp.test_utils import TestClient, TestServer
 from unit.station.test_station_view import robot, state
 
@@ -88,6 +89,7 @@ async def running() -> AsyncIterator[tuple[Planner, FleetLink, Station, TestClie
         await asyncio.gather(task, return_exceptions=True)
 
 
+@pytest.mark.slow
 async def test_a_goal_is_the_managers_matter_once_it_is_back() -> None:
     async with running() as (planner, link, station, client):
         manager = station.fleet_api.manager
@@ -108,6 +110,7 @@ async def test_a_goal_is_the_managers_matter_once_it_is_back() -> None:
         assert ("Robot1", 5) not in planner.goals
 
 
+@pytest.mark.slow
 async def test_a_goal_is_sent_again_while_the_manager_is_away() -> None:
     async with running() as (planner, link, station, client):
         await station.fleet_api.manager.look()
@@ -128,6 +131,7 @@ async def until_sent(planner: Planner, robot_id: str, cell: int) -> None:
             await asyncio.sleep(0.02)
 
 
+@pytest.mark.slow
 async def test_a_goal_cancelled_meanwhile_is_not_sent_again() -> None:
     """The resent goals of two robots are on their way: one is cancelled before its turn, one after it."""
     async with running() as (planner, link, _, _):
@@ -146,6 +150,7 @@ async def test_a_goal_cancelled_meanwhile_is_not_sent_again() -> None:
         assert {("Robot1", 5), ("Robot2", 6)}.isdisjoint(planner.goals)
 
 
+@pytest.mark.slow
 async def test_a_goal_is_not_sent_behind_its_cancellation() -> None:
     """The planner has not answered the cancellation when the goal's turn comes."""
     async with running() as (planner, link, _, _):

@@ -19,6 +19,9 @@ from rce_fleet.experiments.results import Row
 
 pytest.importorskip("matplotlib", reason="figures need rce[figures]")
 
+pytestmark = pytest.mark.slow
+"""They need what draws, which takes long to load."""
+
 LABELS = {
     "laser-network-ros": {"SMS", "MMS", "CRS", "kB/s", "rate=free"},
     "laser-cpu-ros": {"SMS-S", "SMS-C", "MMS-S", "MMS-C", "CRS-S", "CRS-C", "cores", "7.50 Hz"},

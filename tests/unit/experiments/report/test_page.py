@@ -23,6 +23,9 @@ from rce_fleet.experiments.report.summary import summarize
 from rce_fleet.experiments.results import Condition, Row, write_rows
 from rce_fleet.experiments.statistics import effect_size, estimate
 
+pytestmark = pytest.mark.slow
+"""They need what draws, which takes long to load."""
+
 SYSTEMS = {"SMS": "single_master", "MMS": "multi_master", "CRS": "cloud", "-": "-"}
 SOFTWARE = {"ROS": "ros", "ROS C++": "roscpp", "RCE": "rce", "-": "-"}
 UNITS = {"µs": 1e-6, "ms": 1e-3, "%": 0.01, "kB": 1e3, "MB": 1e6, "GB": 1e9, "kbit/s": 1e3, "Mbit/s": 1e6}
