@@ -83,12 +83,9 @@ async def add_user(call: Call) -> models.UserOut:
     body = call.read(models.UserIn)
     services = call.services
     digest = client_digest(body.password)
-    user = User(
-        name=body.name,
-        role=UserRole(body.role),
-        password=await services.authenticator.hash(digest, call.caller.name),
-        created=services.clock(),
-    )
+    hashed = await services.authenticator.hash(digest, call.caller.name)
+    _check_admin_again(call)
+    user = User(name=body.name, role=UserRole(body.role), password=hashed, created=services.clock())
     reply = _views(call).user(user)
     await call.submit(commands.AddUser(user=user), reply)
     await services.authenticator.know(user.name, user.password, digest)
@@ -124,11 +121,15 @@ async def set_password(call: Call) -> None:
     if name not in services.state_service.tables.users:
         raise NotFoundError(f"there is no user {name!r}")
     body = call.read(models.PasswordIn)
-    if name == call.caller.name:
-        await _check_old(call, body.old_password)
+    is_own = name == call.caller.name
+    former = await _check_old(call, body.old_password) if is_own else ""
     digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest, call.caller.name)
-    await services.state_service.submit(commands.SetPassword(name=name, password=hashed))
+    if is_own:
+        call.check_again()
+    else:
+        _check_admin_again(call)
+    await services.state_service.submit(commands.SetPassword(name=name, password=hashed, former=former))
     await services.authenticator.know(name, hashed, digest)
 
 
@@ -141,16 +142,27 @@ async def set_role(call: Call) -> None:
     await call.services.state_service.submit(commands.SetRole(name=call.path("name"), role=role))
 
 
-async def _check_old(call: Call, password: str) -> None:
-    """Check the old password: the finder of a token must not be able to lock its owner out."""
+async def _check_old(call: Call, password: str) -> str:
+    """Check the old password, and return its stored hash.
+
+    The finder of a token must not be able to lock its owner out.
+    """
     if not password:
         raise InvalidRequestError(
             "old_password: is missing; to change your own password, give the one until now"
         )
     try:
-        await call.services.authenticator.verify(call.caller.name, client_digest(password), call.address)
+        digest = client_digest(password)
+        user = await call.services.authenticator.verify(call.caller.name, digest, call.address)
     except WrongCredentialsError:
         raise ForbiddenError("old_password: is wrong") from None
+    return user.password
+
+
+def _check_admin_again(call: Call) -> None:
+    """Check that the caller is still an administrator, after a password that may have waited to be hashed."""
+    if call.check_again().role is not UserRole.ADMIN:
+        raise ForbiddenError("only an administrator may do this")
 
 
 def _views(call: Call) -> Views:

@@ -43,6 +43,8 @@ class SetPassword(Struct, frozen=True, kw_only=True):
     name: str
     password: str
     """argon2 hash."""
+    former: str = ""
+    """Stored hash of the password that allows the change; refused if the password has changed since."""
 
 
 class SetRole(Struct, frozen=True, kw_only=True):

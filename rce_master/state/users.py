@@ -35,6 +35,8 @@ def set_password(tx: Transaction, command: SetPassword) -> None:
     Tokens of robots and of programs stay: they make the fleet independent of the password.
     """
     user = _find(tx, command.name)
+    if command.former and command.former != user.password:
+        raise ConflictError("the password was changed meanwhile; log in with the new one")
     tx.put(replace(user, password=command.password))
     _forget_login(tx, user.name)
     for token in tx.tables.tokens.by("user", user.name):

@@ -60,6 +60,7 @@ class RunSite(Protocol):
         *,
         log_in: bool = True,
         fence: Fence | None = None,
+        hasher: PasswordHasher = HASHER,
         **options: Unpack[MasterOptions],
     ) -> AbstractAsyncContextManager[Site]: ...
 
@@ -192,6 +193,7 @@ async def running_site(
     *,
     log_in: bool = True,
     fence: Fence | None = None,
+    hasher: PasswordHasher = HASHER,
     **options: Unpack[MasterOptions],
 ) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports, and log in."""
@@ -200,7 +202,7 @@ async def running_site(
     state_dir = state_dir or Path(spare.name)
     settings = MasterSettings(bind=LOOPBACK, http_port=0, control_port=0, state_dir=state_dir, **options)
     ready: asyncio.Future[RunningMaster] = asyncio.get_running_loop().create_future()
-    master = Master(settings, SECRET, store or MemoryStore(), hasher=HASHER, fence=fence)
+    master = Master(settings, SECRET, store or MemoryStore(), hasher=hasher, fence=fence)
     task = asyncio.create_task(master.run(ready.set_result))
     try:
         task.add_done_callback(lambda _: ready.done() or ready.cancel())

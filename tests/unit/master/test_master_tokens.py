@@ -96,6 +96,14 @@ def test_password_change_ends_logins_not_robots_tokens() -> None:
     assert (issuer.is_good(login), issuer.is_good(robot)) == (False, True)
 
 
+def test_change_by_an_already_changed_password_is_refused() -> None:
+    world = Issuer().world
+    world.do(commands.SetPassword(name="anna", password="y", former="x"))
+    with pytest.raises(ConflictError, match="password was changed"):
+        world.do(commands.SetPassword(name="anna", password="z", former="x"))
+    assert world.state.tables.users["anna"].password == "y"
+
+
 def test_login_with_password_changed_meanwhile_is_refused() -> None:
     issuer = Issuer()
     _, record = new_token("anna", "", 0.0)
