@@ -409,7 +409,11 @@ class SaveVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class RestoreVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Make a volume's files of a snapshot, in place of those of an earlier placement."""
+    """Make a volume's files of a snapshot, in place of all others.
+
+    Without effect if they were made already: it may be repeated. A volume that a container has is not
+    replaced.
+    """
 
     volume: str
     placement: int

@@ -1,8 +1,8 @@
 """Where the volumes of a machine are, and which placement their files belong to.
 
 ``STATE/volumes/USER/NAME.img``, or a folder ``NAME`` where images do not work. Beside them,
-``.placements/USER/NAME`` holds the number of the placement, ``.removed`` what is to be deleted, ``.scratch``
-what is being made.
+``.placements/USER/NAME`` holds the number of the placement, and of restored files the snapshot; ``.removed``
+what is to be deleted, ``.scratch`` what is being made.
 """
 
 from __future__ import annotations
@@ -82,12 +82,25 @@ class VolumePlaces:
 
     def placement(self, id_: str) -> int:
         """Return the number of the placement of a volume's files; 0 if it is not known."""
+        return self._noted(id_)[0]
+
+    def is_restored(self, id_: str, number: int, snapshot: str) -> bool:
+        """Whether a volume's files were made of this snapshot for this placement.
+
+        The number alone does not say so: a master whose state was restored from a backup counts from an
+        earlier one, and machines may hold files of what it does not know.
+        """
+        return self._noted(id_) == (number, snapshot)
+
+    def _noted(self, id_: str) -> tuple[int, str]:
+        """Return the number of the placement of a volume's files, and the snapshot that they were made of."""
         if not self.exists(id_):
-            return 0
+            return 0, ""
         try:
-            return int(self._marker(id_).read_text())
+            number, _, snapshot = self._marker(id_).read_text().partition(" ")
+            return int(number), snapshot
         except (OSError, ValueError):
-            return 0
+            return 0, ""
 
     def open(self, id_: str) -> int:
         """Open a volume that no container has. Blocks.
@@ -168,8 +181,8 @@ class VolumePlaces:
             os.rmdir("lost+found", dir_fd=root)
         return root
 
-    def replace(self, id_: str, new: Path, placement: int) -> None:
-        """Put a filled volume in the place of a former one, which is discarded. Blocks.
+    def replace(self, id_: str, new: Path, placement: int, snapshot: str) -> None:
+        """Put a volume that was made of a snapshot in the place of a former one, which is discarded. Blocks.
 
         Raises:
             VolumeError: It cannot be put there.
@@ -182,7 +195,7 @@ class VolumePlaces:
             if self.exists(id_) and not self.discard(id_):
                 raise VolumeError("the former files are in the way")
             new.rename(place)
-            self.note_placement(id_, placement)
+            self.note_placement(id_, placement, snapshot)
             sync_folder(place.parent)
         except OSError as error:
             raise VolumeError(f"its files cannot be put in place: {error}") from error
@@ -192,15 +205,20 @@ class VolumePlaces:
         make_accessible(self._scratch)
         remove(self._scratch)
 
-    def note_placement(self, id_: str, number: int) -> None:
+    def note_placement(self, id_: str, number: int, snapshot: str = "") -> None:
         """Note which placement a volume's files belong to, so that it survives a loss of power. Blocks.
+
+        Args:
+            id_: The volume.
+            number: Of the placement.
+            snapshot: What they were made of; empty: they began without files.
 
         Raises:
             OSError: It cannot be written.
         """
         marker = self._marker(id_)
         self.make_folder(marker.parent)
-        write_whole(marker, str(number).encode(), durable=True)
+        write_whole(marker, f"{number} {snapshot}".strip().encode(), durable=True)
 
     def exists(self, id_: str) -> bool:
         """Whether a volume has files here."""

@@ -159,7 +159,8 @@ class SnapshotKeeper:
     async def _restore(self, order: RestoreVolume) -> None:
         error = ""
         try:
-            if self._store.places.placement(order.volume) < order.placement:
+            # A repeated order must not undo what the container has written since.
+            if not self._store.places.is_restored(order.volume, order.placement, order.snapshot):
                 await self._restore_held(order)
         except (SnapshotError, VolumeError, OSError) as fault:
             error = str(fault)
@@ -176,7 +177,9 @@ class SnapshotKeeper:
                         await tree.write(manifest, root, lambda sha256: self._piece(sha256, former))
                 finally:
                     os.close(root)
-                await asyncio.to_thread(self._store.replace, order.volume, new, order.placement)
+                await asyncio.to_thread(
+                    self._store.replace, order.volume, new, order.placement, order.snapshot
+                )
             finally:
                 await asyncio.to_thread(_remove, new)
 

@@ -204,10 +204,10 @@ class VolumeStore:
             return False
         return self._discard(id_)
 
-    def replace(self, id_: str, new: Path, placement: int) -> None:
+    def replace(self, id_: str, new: Path, placement: int, snapshot: str) -> None:
         """Put a filled volume in the place of a former one (:meth:`VolumePlaces.replace`). Blocks."""
         self._forget(id_)
-        self.places.replace(id_, new, placement)
+        self.places.replace(id_, new, placement, snapshot)
 
     def _forget(self, id_: str) -> None:
         self.used.pop(id_, None)

@@ -35,7 +35,8 @@ from rce.control_channel.server import ControlServer
 from rce.control_channel.uploads import Upload, Uploader
 from rce.masters import Masters
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
-from rce_container.volumes import images
+from rce_container.volumes import images, snapshots
+from rce_container.volumes.places import VolumePlaces
 from rce_container.volumes.store import VolumeStore
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.service import SNAPSHOT, SnapshotService
@@ -294,6 +295,59 @@ async def test_a_slow_snapshot_does_not_delay_other_users(
         assert {saved.volume for saved in a.of(VolumeSaved)} == {"other/journal"}
         await a.drop(BOX)
         await a.drop("other/box")
+
+
+async def saved_by(machine: Machine) -> str:
+    """Let a machine save a file; return the snapshot."""
+    files(machine).mkdir(parents=True)
+    (files(machine) / "log").write_text("saved")
+    saved = await save(machine, 0)
+    assert saved.error == ""
+    return saved.snapshot
+
+
+@pytest.mark.parametrize("number", [2, 5])
+async def test_files_of_an_abandoned_state_are_replaced(
+    pair: tuple[Machine, Machine], folder: Path, number: int
+) -> None:
+    """A master whose state was restored from a backup counts placements from an earlier one again."""
+    a, b = pair
+    async with keeping(folder, a, b), a.engine(), b.engine():
+        snapshot = await saved_by(a)
+        files(b).mkdir(parents=True)
+        (files(b) / "log").write_text("abandoned")
+        VolumePlaces(files(b).parents[1], images=False).note_placement(JOURNAL, number)
+        assert (await restore(b, snapshot)).error == ""
+        assert (files(b) / "log").read_text() == "saved"
+        (files(a) / "log").write_text("saved again")
+        assert (await restore(b, (await save(a, 0)).snapshot)).error == ""
+        assert (files(b) / "log").read_text() == "saved again"
+
+
+async def test_repeated_order_keeps_what_was_written_since(
+    pair: tuple[Machine, Machine], folder: Path
+) -> None:
+    a, b = pair
+    async with keeping(folder, a, b), a.engine(), b.engine():
+        snapshot = await saved_by(a)
+        assert (await restore(b, snapshot)).error == ""
+        (files(b) / "log").write_text("newer")
+        assert (await restore(b, snapshot)).error == ""
+        assert (files(b) / "log").read_text() == "newer"
+
+
+async def test_volume_of_running_container_is_not_replaced(
+    pair: tuple[Machine, Machine], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(snapshots, "_RELEASE_S", 0.1)
+    a, b = pair
+    async with keeping(folder, a, b), a.engine(), b.engine():
+        snapshot = await saved_by(a)
+        await put(b, 1, 2, is_new=True)
+        await b.log_holds(BOX, "node", "1 runs")
+        assert "has not ended" in (await restore(b, snapshot)).error
+        assert (files(b) / "log").read_text() != "saved"
+        await b.drop(BOX)
 
 
 async def test_damage_is_refused_and_changes_nothing(pair: tuple[Machine, Machine], folder: Path) -> None:
