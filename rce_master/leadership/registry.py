@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from rce_master.store.etcd.client import EtcdClient
     from rce_master.store.etcd.layout import OtherMaster
+    from rce_master.store.etcd.wire import Record
 
 _log = logging.getLogger(__name__)
 
@@ -43,8 +44,11 @@ class MasterRegistry:
         self._url = ""
         self._own_urls: set[str] = set()
         self._lease = 0
+        """One for all attempts: each that was granted stays for a day."""
         self._revision = 0
         """Of this master's key, as it was found or written last; 0: there was none."""
+        self._written = ""
+        """What this master's key holds by its lease; empty: it has to be written."""
         self._changed = asyncio.Event()
 
     async def check_name(self, client: EtcdClient, answers: Callable[[OtherMaster], Awaitable[bool]]) -> None:
@@ -71,7 +75,7 @@ class MasterRegistry:
     def announce(self, url: str) -> None:
         """Say where other masters reach this one; :meth:`run` writes it."""
         if url != self._url:
-            self._url, self._lease = url, 0
+            self._url = url
             self._own_urls.add(url)
             self._changed.set()
 
@@ -100,26 +104,41 @@ class MasterRegistry:
                 continue
 
     async def _write(self) -> None:
-        if self._lease and await self._client.renew(self._lease):
+        url, key = self._url, self._keys.masters + self._name
+        # It is read each time: operators remove the keys of machines that they take out of a cluster.
+        record = await self._client.get(key)
+        if record is None or record.modified != self._revision:
+            self._note_found(record)
+            self._written = ""
+        is_kept = bool(self._lease and await self._client.renew(self._lease))
+        if is_kept and self._written == url:
             return
-        url = self._url
-        lease, _ = await self._client.grant(KEPT_S)
-        key = self._keys.masters + self._name
-        put = Put(key, write_master(url), lease)
+        if not is_kept:
+            self._lease, _ = await self._client.grant(KEPT_S)
+        put = Put(key, write_master(url), self._lease)
         while True:
             unchanged = Condition(key, Subject.MODIFIED, self._revision)
             outcome = await self._client.transact([unchanged], [put], [key])
             if outcome.done:
                 break
-            # It ended, an earlier attempt was done after all, or another master was started meanwhile.
-            self._revision = 0
-            for record in outcome.found:
-                if (other := read_master(self._keys, record)).url not in self._own_urls:
-                    raise StoreError(_taken(other))
-                self._revision = record.modified
-        self._revision = outcome.revision
-        if url == self._url:
-            self._lease = lease
+            self._note_found(next(iter(outcome.found), None))
+        self._revision, self._written = outcome.revision, url
+
+    def _note_found(self, record: Record | None) -> None:
+        """Note the key of this master, which is not as it was.
+
+        It ended or was removed, an earlier attempt was done after all, or another master was started
+        meanwhile.
+
+        Raises:
+            StoreError: Another one has the name.
+        """
+        self._revision = 0
+        if record is None:
+            return
+        if (other := read_master(self._keys, record)).url not in self._own_urls:
+            raise StoreError(_taken(other))
+        self._revision = record.modified
 
     async def others(self) -> Sequence[OtherMaster]:
         """Return the other masters, also those that are down, each by its newest name.

@@ -8,19 +8,24 @@ import logging
 import signal
 from typing import TYPE_CHECKING
 
+import aiohttp
 import pytest
 from support.engine import until
 from support.etcd import cluster
 from support.masters import LOOPBACK, MasterProcess
 
+from rce_master.cluster.engines import EngineMaster, forget_masters
 from rce_master.exceptions import MasterError
+from rce_master.leadership import registry as registry_module
 from rce_master.leadership.registry import MasterRegistry
 from rce_master.store.etcd import EtcdClient
-from rce_master.store.etcd.layout import prepare
+from rce_master.store.etcd.layout import Keys, prepare
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from support.etcd import Cluster
 
     from rce_master.store.etcd.layout import OtherMaster
 
@@ -109,6 +114,52 @@ async def test_a_master_returns_at_another_address(tmp_path: Path) -> None:
 
         with pytest.raises(MasterError, match="has the name one too"):
             await MasterRegistry(client, "/rce", "one").check_name(client, answers)
+
+
+async def test_removed_master_that_runs_is_counted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after ``rce cluster remove`` and ``rce cluster join`` while its master runs on."""
+    monkeypatch.setattr(registry_module, "_RENEWAL_S", 0.1)
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=PATIENT_S) as client:
+        await prepare(client, "/rce")
+        registry, reader = (MasterRegistry(client, "/rce", name) for name in ("m3", "the test"))
+        async with runs(registry, FIRST):
+            await until(lambda: _is_at(reader, FIRST))
+            written = await client.get(Keys("/rce").masters + "m3")
+            await forget_masters(client, [EngineMaster("m3", "10.0.0.1", "/rce")])
+
+            async def is_written_again() -> bool:
+                record = await client.get(Keys("/rce").masters + "m3")
+                return record is not None and record != written
+
+            await until(is_written_again)
+            assert await url_of(reader) == FIRST
+        assert await leases(etcd) == 1
+
+
+async def test_master_without_its_name_takes_few_leases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It tries again and again, and each lease would stay for a day."""
+    monkeypatch.setattr(registry_module, "_PAUSE_S", 0.01)
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=PATIENT_S) as client:
+        await prepare(client, "/rce")
+        first, second = (MasterRegistry(client, "/rce", "copy") for _ in range(2))
+        reader = MasterRegistry(client, "/rce", "the test")
+        async with runs(first, FIRST):
+            await until(lambda: _is_at(reader, FIRST))
+            with caplog.at_level(logging.DEBUG, registry_module.__name__):
+                async with runs(second, SECOND):
+                    await until(lambda: caplog.text.count("has the name copy too") >= 5)
+        assert await leases(etcd) <= 2
+
+
+async def leases(etcd: Cluster) -> int:
+    """Return how many leases there are."""
+    url = f"http://{etcd.members[0].endpoint}/v3/lease/leases"
+    async with aiohttp.ClientSession() as session, session.post(url, json={}) as reply:
+        return len((await reply.json()).get("leases", ()))
 
 
 async def test_a_renamed_master_counts_once(tmp_path: Path) -> None:
