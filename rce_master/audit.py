@@ -203,7 +203,7 @@ class AuditLog:
     def _count(self, key: _Key, now: float, times: int = 1) -> int:
         """Count a repetition; return how many are to be written now: one or more once a minute, else 0."""
         since, count = self._repeated.get(key, (0.0, 0))
-        if now - since < REPEAT_S:
+        if not _is_due(since, now):
             self._repeated[key] = (since, count + times)
             return 0
         self._repeated.pop(key, None)
@@ -216,7 +216,7 @@ class AuditLog:
     def flush(self) -> None:
         """Write the repetitions that are due."""
         now = self._clock()
-        for key in [key for key, (since, _) in self._repeated.items() if now - since >= REPEAT_S]:
+        for key in [key for key, (since, _) in self._repeated.items() if _is_due(since, now)]:
             self._add_missed(key, self._repeated.pop(key)[1])
 
     def since(self, id_: int, limit: int, user: str = "") -> list[Record]:
@@ -311,6 +311,11 @@ def newest(folder: Path, files: int = FILES) -> list[Record]:
         if len(found) >= KEPT:
             break
     return found[-KEPT:]
+
+
+def _is_due(since: float, now: float) -> bool:
+    """Return whether repetitions are to be written; also after the clock was set back."""
+    return not 0 <= now - since < REPEAT_S
 
 
 def _numbered(folder: Path, number: int) -> Path:

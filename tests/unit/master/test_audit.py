@@ -90,6 +90,20 @@ def test_flood_of_refusals_is_one_record_a_minute(tmp_path: Path) -> None:
     log.close()
 
 
+def test_clock_set_back_hides_no_refusals(tmp_path: Path) -> None:
+    clock = Clock()
+    clock.now = 100_000.0
+    log = AuditLog(tmp_path, clock)
+    for _ in range(3):
+        log.refuse("anna", "log_in", address="10.0.0.1")
+        log.refuse("bert", "log_in", address="10.0.0.1")
+    clock.now -= 86_400
+    log.refuse("anna", "log_in", address="10.0.0.1")
+    log.flush()
+    assert [(r.user, r.times) for r in log.since(2, 10)] == [("anna", 3), ("bert", 2)]
+    log.close()
+
+
 def test_refusals_from_many_addresses_stay_bounded(tmp_path: Path) -> None:
     log = AuditLog(tmp_path, Clock())
     for number in range(3000):
