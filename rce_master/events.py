@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
+from rce_master.state.changes import USER_ADDED, USER_REMOVED
+
 if TYPE_CHECKING:
     from rce_master.state.changes import StateEvent
 
@@ -86,6 +88,8 @@ class EventLog:
     def __init__(self, start: float, capacity: int = CAPACITY, *, term: int = 0) -> None:
         self._events: dict[str, _UserLog] = {}
         """By user."""
+        self._made: dict[str, int] = {}
+        """Ids of the events with which users were made, by user."""
         self._count = 0
         self._capacity = capacity
         self._first_id = (_FIRST_TERM + term) * IDS_OF_TERM if term else int(start * 1000)
@@ -108,6 +112,10 @@ class EventLog:
             text=state_event.text,
         )
         self._next_id += 1
+        if event.kind == USER_ADDED:
+            self._made[event.subject] = event.id
+        elif event.kind == USER_REMOVED:
+            self._made.pop(event.subject, None)
         self._events.setdefault(event.user, _UserLog()).append(event)
         self._count += 1
         if self._count > self._capacity:
@@ -134,6 +142,13 @@ class EventLog:
             return start
         forgotten = max((log.forgotten for log in logs), default=start)
         return max(id_, start) if id_ < max(start, forgotten) else None
+
+    def made(self, user: str) -> int:
+        """Return after which event those of a user begin: earlier ones are of a former user of that name.
+
+        Times do not tell it: the clock may have been set back since the user was made.
+        """
+        return self._made.get(user, 0)
 
     def wake(self) -> None:
         """Wake all followers, so that they check whether they may still follow."""

@@ -134,12 +134,12 @@ def _page(call: Call, scope: str | None) -> models.EventsOut:
     limit, since = call.number("limit", MAX_ITEMS), call.number("cursor", call.number("since", 0))
     if not 0 < limit <= MAX_ITEMS:
         raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_ITEMS}")
-    born = _born(call, scope)
+    made = log.made(scope or "")
     if (gap := _gap(call, scope, since)) is not None:
         since = gap.id
     found = log.since(since, limit + 1, scope)
     has_more, found = len(found) > limit, found[:limit]
-    shown = [event for event in found if event.time >= born and _concerns(call, event)]
+    shown = [event for event in found if event.id > made and _concerns(call, event)]
     if gap is not None:
         shown.insert(0, gap)
     return models.EventsOut(
@@ -149,14 +149,8 @@ def _page(call: Call, scope: str | None) -> models.EventsOut:
     )
 
 
-def _born(call: Call, scope: str | None) -> float:
-    """Return when a user was made: earlier events belong to a former user of that name."""
-    owner = call.services.state_service.tables.users.get(scope or "")
-    return owner.created if owner is not None else 0.0
-
-
 async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
-    born = _born(call, scope)
+    made = call.services.events.made(scope or "")
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
@@ -174,7 +168,7 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
                 await call.write(response, _frame(_farewell(call, last)))
                 return response
             # Periodic comments prevent timeouts of proxies, and detect that a client has disconnected.
-            frames = [_frame(event) for event in news if event.time >= born and _concerns(call, event)]
+            frames = [_frame(event) for event in news if event.id > made and _concerns(call, event)]
             if frames or clock() >= written + HEARTBEAT_S:
                 await call.write(response, b"".join(frames) or b":\n\n")
                 written = clock()

@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 
+USER_ADDED, USER_REMOVED = "user_added", "user_removed"
+"""Kinds of events that begin and end the time of a user of some name."""
+
 
 @dataclass(frozen=True, slots=True)
 class Withdrawal:

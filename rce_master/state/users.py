@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from rce.model import is_name
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import answers, endpoints, limits, packages, robots, tokens, volumes
+from rce_master.state.changes import USER_ADDED, USER_REMOVED
 from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def add_user(tx: Transaction, command: AddUser) -> None:
     if user.name in tx.tables.users:
         raise ConflictError(f"there is a user {user.name!r} already")
     tx.put(user)
-    tx.happen("user_added", user.name, user.role.value, user="")
+    tx.happen(USER_ADDED, user.name, user.role.value, user="")
 
 
 def set_password(tx: Transaction, command: SetPassword) -> None:
@@ -78,7 +79,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     limits.forget(tx, user.name)
     answers.forget_user(tx, user.name)
     tx.delete(tx.tables.users, user.name)
-    tx.happen("user_removed", user.name, user="")
+    tx.happen(USER_REMOVED, user.name, user="")
 
 
 def remember_login(tx: Transaction, command: RememberLogin) -> None:

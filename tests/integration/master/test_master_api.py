@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import time
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import Drop, Put
@@ -272,6 +275,22 @@ async def test_user_does_not_see_a_predecessors_records(site: Site) -> None:
     token = await site.login("anna", "one")
     await site.api("POST", "/containers", {"tag": "mine"}, token=token, status=204)
     assert [e["subject"] for e in await read_events(site, 1, token, since=0)] == ["anna/mine"]
+
+
+async def test_user_made_before_clock_went_back_sees_events(
+    run_site: RunSite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, ahead = time.time, 86_400.0
+    monkeypatch.setattr(time, "time", lambda: clock() + ahead)
+    async with run_site() as site:
+        await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+        ahead = 0.0
+        anna = await site.login("anna", "one")
+        await site.api("POST", "/containers", {"tag": "mine"}, token=anna, status=204)
+        headers = {"Authorization": f"Bearer {anna}", "Accept": "application/json"}
+        async with site.session.get(f"{site.url}api/v1/events", headers=headers) as reply:
+            assert [event["subject"] for event in (await reply.json())["events"]] == ["anna/mine"]
+        assert [e["subject"] for e in await read_events(site, 1, anna, since=0)] == ["anna/mine"]
 
 
 async def test_a_stream_ends_with_the_token(site: Site) -> None:

@@ -26,6 +26,18 @@ def test_ids_grow_over_terms_whatever_the_clocks_say() -> None:
     assert [event.text for event in second.since(first.last_id)] == ["y"]
 
 
+def test_events_of_a_user_begin_where_it_was_made() -> None:
+    """Whatever the clock says, which may go back meanwhile."""
+    log = EventLog(1.8e9)
+    assert log.made("anna") == 0, "it was made before this log began"
+    log.add(state_event("former"), 1.8e9)
+    log.add(StateEvent("user_removed", "", "anna", ""), 1.8e9)
+    assert log.made("anna") == 0
+    log.add(StateEvent("user_added", "", "anna", "user"), 1.8e9)
+    log.add(state_event("new"), 1.7e9)
+    assert [event.text for event in log.since(log.made("anna"), user="anna")] == ["new"]
+
+
 def test_what_a_follower_missed_is_known() -> None:
     log = EventLog(1.0, capacity=3)
     assert log.missed(999) is None
