@@ -12,7 +12,7 @@ import fcntl
 import os
 import re
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,23 +111,38 @@ class CertificateFolder:
         Raises:
             CertificateError: The name cannot be used, no authority is here, or a file cannot be written.
         """
+        hosts, named = tuple(hosts), None
+        if not hosts:
+            with contextlib.suppress(CertificateError):
+                hosts, named = (former := self.details(name)).hosts, self._named(former)
+        return self._issue(name, hosts or (name,), named, days)
+
+    def _issue(
+        self, name: str, hosts: tuple[str, ...], named: tuple[str, ...] | None, days: float = CERTIFICATE_DAYS
+    ) -> Details:
+        """Issue a certificate.
+
+        Args:
+            name: Its owner.
+            hosts: What it is good for.
+            named: Those of them that an operator named; None: all.
+            days: How long it is valid.
+        """
         if not _NAME.fullmatch(name) or name in _KEPT_NAMES:
             raise CertificateError(
                 f"{name!r} cannot be a certificate's name: use up to 63 letters, digits, '.', '_' and '-',"
                 f" and not {' or '.join(map(repr, _KEPT_NAMES))}"
             )
         self._need_authority()
-        hosts = tuple(hosts)
-        if not hosts:
-            with contextlib.suppress(CertificateError):
-                hosts = self.details(name).hosts
-        if not hosts:
-            hosts = (name,)
         issued = issue(self._authority(), name, hosts, days)
         with self._locked():
-            self._record(name, read_details(issued.certificate))
+            self._record(name, read_details(issued.certificate), named)
             self._write(name, issued)
         return self.details(name)
+
+    def _named(self, issued: Details) -> tuple[str, ...] | None:
+        """Return the hosts of a certificate that an operator named; None: all."""
+        return next((one.named for one in self._records() if int(one.serial, 16) == issued.serial), None)
 
     def revoke(self, name: str) -> list[Revocation]:
         """Revoke all certificates of a name; programs that check the list load it by themselves.
@@ -199,6 +214,9 @@ class CertificateFolder:
     def ensure(self, name: str, hosts: Iterable[str]) -> str:
         """Make or renew the authority and a certificate that is valid for ``hosts``, if needed.
 
+        A renewal keeps the hosts that an operator named, and of the others only those that are asked for: a
+        machine gets new addresses again and again.
+
         Returns:
             What was done, in words; empty if nothing.
 
@@ -208,10 +226,10 @@ class CertificateFolder:
         wanted = tuple(dict.fromkeys(hosts))
         if not self.authority.exists():
             self.make_authority()
-            self.issue(name, wanted)
+            self._issue(name, wanted, ())
             return f"made an authority and the certificate {name} in {self.path}"
         if not self.has(name):
-            self.issue(name, wanted)
+            self._issue(name, wanted, ())
             return f"issued the certificate {name} in {self.path}"
         found = self.details(name)
         missing = [host for host in wanted if not found.covers(host)]
@@ -222,7 +240,9 @@ class CertificateFolder:
             _read(self.certificate(name)), _read(self.authority)
         ):
             return ""  # it was issued elsewhere, so it is renewed there; the master warns when it is time
-        self.issue(name, (*found.hosts, *missing))
+        named = self._named(found)
+        kept = found if named is None else replace(found, hosts=named)
+        self._issue(name, (*kept.hosts, *(host for host in wanted if not kept.covers(host))), kept.hosts)
         why = f"for {', '.join(missing)}" if missing else "before it expires"
         if revoked:
             why = "because it was revoked"
@@ -264,11 +284,11 @@ class CertificateFolder:
         except msgspec.MsgspecError as error:
             raise CertificateError(f"{file}: {error}; remove the damaged line") from error
 
-    def _record(self, name: str, issued: Details) -> None:
+    def _record(self, name: str, issued: Details, named: tuple[str, ...] | None) -> None:
         """Record a certificate before it is handed out, and remove expired ones from the record."""
         now = datetime.now(UTC)
         kept = [record for record in self._records() if record.expires > now]
-        kept.append(Record(name, f"{issued.serial:x}", issued.expires))
+        kept.append(Record(name, f"{issued.serial:x}", issued.expires, named))
         with self._writing():
             text = b"".join(msgspec.json.encode(record) + b"\n" for record in kept)
             _write_private(self.path / _RECORDS, text)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rce.lookups import LOOKUPS
@@ -22,6 +23,9 @@ CHECK_EVERY_S = 6 * 3600.0
 
 _NAME_SIGNS = str.maketrans("", "", "-._")
 _INTERNET = (socket.AF_INET, socket.AF_INET6)
+_IPV6_ADDRESSES = Path("/proc/net/if_inet6")
+_TEMPORARY = 0x01
+"""The kernel's IFA_F_TEMPORARY."""
 
 
 @contextlib.asynccontextmanager
@@ -83,16 +87,34 @@ async def _keep(settings: EngineSettings, say: Callable[[str], None]) -> None:
 
 
 def own_hosts(more: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return this machine's names and addresses, and those of ``more`` that name a machine.
+    """Return this machine's names and lasting addresses, and those of ``more`` that name a machine.
 
     No name server is asked.
     """
     import psutil
 
     found = ["localhost", "127.0.0.1", "::1", socket.gethostname()]
+    brief = _temporary_addresses()
     for addresses in psutil.net_if_addrs().values():
-        found += [address.address for address in addresses if address.family in _INTERNET]
+        found += [
+            address.address
+            for address in addresses
+            if address.family in _INTERNET and address.address not in brief
+        ]
     return tuple(dict.fromkeys(host for host in (*found, *more) if _is_useful(host)))
+
+
+def _temporary_addresses() -> set[str]:
+    """Return the IPv6 addresses that the machine replaces after a day, and that serve its own connections."""
+    try:
+        lines = [line.split() for line in _IPV6_ADDRESSES.read_text().splitlines()]
+    except OSError:  # a machine without IPv6
+        return set()
+    return {
+        str(ipaddress.IPv6Address(int(address, 16)))
+        for address, _, _, _, flags, _ in lines
+        if int(flags, 16) & _TEMPORARY
+    }
 
 
 def _is_useful(host: str) -> bool:

@@ -19,13 +19,15 @@ from rce.tls.authority import CLOCK_SKEW, Issued
 from rce.tls.faults import CertificateError
 
 
-class Record(msgspec.Struct, frozen=True):
+class Record(msgspec.Struct, frozen=True, omit_defaults=True):
     """One certificate that was issued."""
 
     name: str
     serial: str
     """In hex."""
     expires: datetime
+    named: tuple[str, ...] | None = None
+    """The hosts that an operator named; the others were found at the machine. None: all were named."""
 
 
 @dataclass(frozen=True, slots=True)

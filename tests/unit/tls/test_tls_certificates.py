@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
+import socket
 import ssl
 import stat
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
+from rce.tls import keeping
 from rce.tls.authority import Issued, is_signed_by, issue, make_authority, read_details
 from rce.tls.faults import CertificateError
 from rce.tls.folder import AUTHORITY, CertificateFolder
@@ -180,6 +185,47 @@ def test_ensure_makes_renews_and_adds_hosts(folder: CertificateFolder, tmp_path:
     fresh.issue("engine", days=29)
     assert "before it expires" in fresh.ensure("engine", ["a.example"])
     assert fresh.details("engine").days_left() > 390
+
+
+def test_renewal_leaves_out_lost_addresses_not_named_ones(tmp_path: Path) -> None:
+    """A machine gets new addresses every day; what an operator named stays."""
+    folder = CertificateFolder(tmp_path / "certificates")
+    for day in range(1, 5):
+        assert folder.ensure("engine", ["localhost", f"10.0.0.{day}"])
+    assert folder.details("engine").hosts == ("localhost", "10.0.0.4")
+    folder.issue("engine", ("robots.example", "[fd00::5]"))
+    for day in range(1, 5):
+        assert folder.ensure("engine", ["localhost", "fd00::5", f"10.0.0.{day}"])
+    kept = {"robots.example", "fd00::5", "localhost", "10.0.0.4"}
+    assert set(folder.details("engine").hosts) == kept
+    assert set(folder.issue("engine").hosts) == kept, "a renewal by hand keeps them as they are"
+    assert folder.ensure("engine", ["localhost", "fd00::5", "10.0.0.5"])
+    assert set(folder.details("engine").hosts) == {*kept - {"10.0.0.4"}, "10.0.0.5"}
+
+
+def test_hosts_of_an_older_record_count_as_named(folder: CertificateFolder) -> None:
+    folder.issue("engine", ("robots.example",))
+    (record,) = (folder.path / "issued.jsonl").read_text().splitlines()
+    assert set(json.loads(record)) == {"name", "serial", "expires"}, "as earlier releases wrote it"
+    assert folder.ensure("engine", ["localhost"])
+    assert set(folder.details("engine").hosts) == {"robots.example", "localhost"}
+
+
+def test_own_hosts_lack_temporary_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With privacy addresses, a machine has another one each day."""
+    there = ["10.0.0.7", "fd00::5", "fd00::abcd", "fe80::1%eth0"]
+    families = [socket.AF_INET, *[socket.AF_INET6] * 3]
+    found = [SimpleNamespace(family=kind, address=one) for kind, one in zip(families, there, strict=True)]
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: {"eth0": found})
+    kernel = tmp_path / "if_inet6"
+    monkeypatch.setattr(keeping, "_IPV6_ADDRESSES", kernel)
+    assert {*there[:3]} <= set(keeping.own_hosts()), "without IPv6 the kernel has no such file"
+    kernel.write_text(
+        "fe800000000000000000000000000001 02 40 20 80     eth0\n"
+        "fd000000000000000000000000000005 02 40 00 00     eth0\n"
+        "fd00000000000000000000000000abcd 02 40 00 01     eth0\n"
+    )
+    assert set(keeping.own_hosts()) & set(there) == {"10.0.0.7", "fd00::5"}
 
 
 def test_ensure_leaves_certificates_of_others_alone(folder: CertificateFolder, tmp_path: Path) -> None:
