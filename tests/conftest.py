@@ -262,13 +262,14 @@ def _group(items: list[pytest.Item]) -> None:
     """Keep tests together, in one worker, that share what is made once or is the machine's.
 
     What podman keeps is the machine's; what a person finds out about the sandbox takes long. Tests in real
-    time have one worker: robots of two that run late together drive for longer, and may not arrive in time.
+    time have one worker for floors full of robots, and one for machines that fail or are measured: robots of
+    several that run late together drive for longer, and may not arrive in time.
     """
     for item in items:
         if item.get_closest_marker("xdist_group"):
             continue
-        if item.get_closest_marker("real_time"):
-            item.add_marker(pytest.mark.xdist_group("real time"))
+        if chain := item.get_closest_marker("real_time"):
+            item.add_marker(pytest.mark.xdist_group(f"real time of {chain.args[0]}"))
             continue
         callspec = getattr(item, "callspec", None)
         person = callspec and callspec.params.get("person")

@@ -21,7 +21,7 @@ from rce_fleet.experiments.runner import DONE
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.real_time,
+    pytest.mark.real_time("machines"),
     pytest.mark.needs("netns", "cgroups", "rospy", "pymunk"),
     pytest.mark.timeout(TIMEOUT_S),
 ]

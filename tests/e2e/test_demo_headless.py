@@ -21,7 +21,12 @@ from rce_fleet.drivers.report import read_report
 from rce_fleet.exceptions import StationUnavailableError
 from rce_fleet.station.client import StationClient
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk"), pytest.mark.timeout(1000)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.real_time("robots"),
+    pytest.mark.needs("pymunk"),
+    pytest.mark.timeout(1000),
+]
 
 TIMEOUT_S = 400.0
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]

@@ -12,7 +12,12 @@ from support.ports import free_port
 
 from rce_fleet.station.layers.kinds import LAYERS
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk"), pytest.mark.timeout(400)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.real_time("robots"),
+    pytest.mark.needs("pymunk"),
+    pytest.mark.timeout(400),
+]
 
 WAIT_S = 240.0
 WITHOUT_GOAL = set(LAYERS) - {"plan"}

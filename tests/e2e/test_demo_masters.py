@@ -19,7 +19,7 @@ from rce_fleet.drivers.report import read_report
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.real_time,
+    pytest.mark.real_time("machines"),
     pytest.mark.needs("etcd", "pymunk"),
     pytest.mark.timeout(900),
 ]

@@ -22,7 +22,12 @@ from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.exceptions import StationError
 from rce_fleet.station.client import StationClient
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk"), pytest.mark.timeout(1000)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.real_time("robots"),
+    pytest.mark.needs("pymunk"),
+    pytest.mark.timeout(1000),
+]
 
 ROBOTS, SEED = 2, 17
 """Its ways are short."""

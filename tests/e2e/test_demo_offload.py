@@ -8,7 +8,7 @@ import sys
 import pytest
 from support.demo import clean_folder, environment, run_headless
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk")]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time("robots"), pytest.mark.needs("pymunk")]
 
 TIMEOUT_S = 400.0
 

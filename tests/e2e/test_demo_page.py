@@ -20,7 +20,7 @@ from rce_fleet.planning.scenario import midway_cell
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.real_time,
+    pytest.mark.real_time("robots"),
     pytest.mark.needs("chromium", "pymunk"),
     pytest.mark.asyncio(loop_scope="module"),
     pytest.mark.timeout(900),

@@ -13,7 +13,7 @@ from support.engine import until
 from rce_fleet.exceptions import StationError
 from rce_fleet.station.client import StationClient
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time("machines")]
 
 
 async def reaches(station: StationClient, robot: str, cell: int) -> None:

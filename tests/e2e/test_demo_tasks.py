@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support.demo import run_headless
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk")]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time("robots"), pytest.mark.needs("pymunk")]
 
 
 FLOOR = ["......", ".@@...", "......", "...@@.", "......"]

@@ -24,7 +24,7 @@ from support.demo import running_demo
 from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, verify
 from rce_fleet.demo.task_run import kill_container
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk")]
+pytestmark = [pytest.mark.e2e, pytest.mark.real_time("robots"), pytest.mark.needs("pymunk")]
 
 LONGEST_S = 240.0
 """For one step of the day on a loaded machine; without load each takes a few seconds."""

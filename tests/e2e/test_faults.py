@@ -13,7 +13,7 @@ from faults.world import world
 pytestmark = [
     pytest.mark.e2e,
     pytest.mark.needs("root", "netns", "etcd", "iptables"),
-    pytest.mark.real_time,
+    pytest.mark.real_time("machines"),
 ]
 
 SEED = 1

@@ -17,7 +17,12 @@ from support.ports import free_port
 
 from rce_fleet.wiring import FLEET_CONTAINER
 
-pytestmark = [pytest.mark.e2e, pytest.mark.real_time, pytest.mark.needs("pymunk"), pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.real_time("machines"),
+    pytest.mark.needs("pymunk"),
+    pytest.mark.timeout(600),
+]
 
 LONGEST_S = 240.0
 AGAIN_S = 0.3
