@@ -93,7 +93,6 @@ class ActionClient:
         self._clock = _silence_clock(node)
         async with AsyncExitStack() as stack:
             stack.callback(self._lose_all, "the client was closed")
-            tasks = await stack.enter_async_context(TaskScope())
             self._goal = await node.advertise(f"{self.name}/goal", types.action_goal)
             stack.push_async_callback(release, self._goal)
             self._cancel = await node.advertise(f"{self.name}/cancel", topics.GOAL_ID)
@@ -106,6 +105,7 @@ class ActionClient:
                 subscriber = await node.subscribe(f"{self.name}/{topic}", message_type, callback)
                 stack.push_async_callback(release, subscriber)
                 self._inputs.append(subscriber)
+            tasks = await stack.enter_async_context(TaskScope())  # ends first: it publishes
             tasks.spawn(self._look_after_goals(), name=f"goals of {self.name}")
             self._stack = stack.pop_all()
         return self

@@ -26,6 +26,7 @@ from rce.ros.actions.ledger import Arrival
 from rce.ros.actions.work import Handler
 from rce.ros.core import Core
 from rce.ros.errors import NodeClosedError
+from rce.ros.node.master import MasterClient
 from rce.ros.types import Message, SerializationError, Time
 
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
@@ -349,6 +350,29 @@ async def test_a_goal_that_got_lost_on_the_way_is_sent_again(
         goal = await client.send(order=1)
         assert list((await goal.result()).sequence) == [0, 1, 1]
         assert len(lost) == 1
+
+
+async def test_leaving_with_an_unheard_goal_keeps_the_error(
+    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A goal that is sent again meets no closed publisher while the master is slow."""
+    monkeypatch.setattr("rce.ros.actions.client.TICK", 0.001)
+    monkeypatch.setattr("rce.ros.actions.tracker.REPEAT_AFTER", 0.0)
+    unregister = MasterClient.unregister_publisher
+
+    async def unregister_slowly(master: MasterClient, topic: str) -> None:
+        await asyncio.sleep(0.1 if topic == "/job/goal" else 0)
+        await unregister(master, topic)
+
+    async def fail_with_a_goal_under_way() -> None:
+        async with pair(make_node, fibonacci) as (server, client):
+            monkeypatch.setattr(server._ledger, "receive", lambda *_: Arrival.REPEATED)
+            await client.send(order=1)
+            raise ZeroDivisionError
+
+    monkeypatch.setattr(MasterClient, "unregister_publisher", unregister_slowly)
+    with pytest.raises(ZeroDivisionError):
+        await fail_with_a_goal_under_way()
 
 
 async def test_waiting_has_an_end(make_node: MakeNode) -> None:
