@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 from rce.ros.errors import NodeClosedError
 from rce.ros.node.clock import NANOSECONDS, Clock
@@ -28,6 +31,7 @@ class RosoutHandler(logging.Handler):
     """Publishes log records as ``rosgraph_msgs/Log``.
 
     Records that come before the first listener wait for it; the message type is loaded then.
+    Made in the event loop's thread; records of other threads are handed to it.
     """
 
     def __init__(
@@ -39,9 +43,15 @@ class RosoutHandler(logging.Handler):
         self._node = node
         self._topics = topics
         self._waiting: deque[logging.LogRecord] = deque(maxlen=MAX_WAITING)
+        self._loop = asyncio.get_running_loop()
+        self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Publish a record, after those that waited."""
+        if threading.get_ident() != self._thread:
+            with suppress(RuntimeError):  # the loop has ended, and so has the node
+                self._loop.call_soon_threadsafe(self.emit, record)
+            return
         self._waiting.append(record)
         self.flush()
 

@@ -5,18 +5,25 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import threading
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFaultError
 from rce.ros.logfiles import LogFile, log_folder
-from rce.ros.node import Node
-from rce.ros.node.rosout import KIND, MD5SUM
+from rce.ros.node import Node, Publisher
+from rce.ros.node.rosout import KIND, MD5SUM, RosoutHandler
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
+
+BATCH = 25
+"""Records of a thread between two looks: with as many of the loop, they fit into all queues."""
 
 
 @pytest.fixture
@@ -53,6 +60,52 @@ async def test_records_of_all_nodes_are_gathered(full_core: Core) -> None:
                     break
         expected = {(n, value, f"{level} of {n}") for level, value in levels.items() for n in ("/a", "/b")}
         assert found == expected
+
+
+@pytest.mark.parametrize("intra_process", [True, False])
+async def test_records_of_threads_are_published_in_the_loop(
+    full_core: Core, intra_process: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Connections and queues belong to the thread of the event loop."""
+    threads: set[int] = set()
+    publish = Publisher.publish
+
+    def note_thread(publisher: Publisher, **fields: Any) -> None:
+        threads.add(threading.get_ident())
+        publish(publisher, **fields)
+
+    monkeypatch.setattr(Publisher, "publish", note_thread)
+    make = partial(Node, argv=[], master_uri=full_core.uri, intra_process=intra_process)
+    async with make("worker") as worker, make("viewer", rosout=False) as viewer:
+        heard = await viewer.subscribe("/rosout", KIND)
+        await heard.wait_for_publishers(timeout=10)
+
+        def work(start: int) -> None:
+            for number in range(start, start + BATCH):
+                worker.log.info("thread %d", number)
+
+        async with asyncio.timeout(60):
+            for start in range(0, 1000, BATCH):
+                working = asyncio.create_task(asyncio.to_thread(work, start))
+                for number in range(start, start + BATCH):
+                    worker.log.info("loop %d", number)
+                    await asyncio.sleep(0)
+                await working
+                found = [(await anext(heard)).msg for _ in range(2 * BATCH)]
+                for source in ("thread", "loop"):
+                    expected = [f"{source} {number}" for number in range(start, start + BATCH)]
+                    assert [text for text in found if text.startswith(source)] == expected
+    assert threads == {threading.get_ident()}
+
+
+def test_record_of_a_thread_after_the_loop_is_dropped() -> None:
+    async def handler_of_a_node() -> logging.Handler:
+        async with Core(port=0) as core, Node("a", argv=[], master_uri=core.uri) as node:
+            return next(handler for handler in node.log.handlers if isinstance(handler, RosoutHandler))
+
+    handler = asyncio.run(handler_of_a_node())
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(handler.handle, logging.makeLogRecord({"msg": "late"})).result()
 
 
 async def test_records_are_kept_in_a_file(tmp_path: Path) -> None:
