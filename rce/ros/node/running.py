@@ -29,10 +29,17 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+StopCallback = Callable[[str], None]
+
+_callbacks: dict[asyncio.AbstractEventLoop, list[StopCallback]] = {}
+"""What the next signal calls, by event loop; a loop that is not in here leaves signals their usual effect."""
+
 
 @contextmanager
-def stop_signals(callback: Callable[[str], None]) -> Iterator[None]:
+def stop_signals(callback: StopCallback) -> Iterator[None]:
     """Call ``callback(reason)`` at the first signal. The second one has its usual effect.
+
+    A signal is for all nodes of a program: it calls the callbacks of all blocks that have begun.
 
     Without effect outside the main thread, where Python takes no signals, and in a program that shares its
     process with others: they belong to the process.
@@ -41,18 +48,27 @@ def stop_signals(callback: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     loop = asyncio.get_running_loop()
-
-    def release() -> None:
+    callbacks = _callbacks.get(loop)
+    if callbacks is None:
+        callbacks = _callbacks[loop] = []
         for number in _SIGNALS:
-            loop.remove_signal_handler(number)
-
-    def received(number: signal.Signals) -> None:
-        release()
-        callback(f"received {number.name}")
-
-    for number in _SIGNALS:
-        loop.add_signal_handler(number, received, number)
+            loop.add_signal_handler(number, _received, loop, number)
+    callbacks.append(callback)
     try:
         yield
     finally:
-        release()
+        callbacks.remove(callback)
+        if not callbacks and _callbacks.get(loop) is callbacks:  # not those of a block after a signal
+            _leave_signals(loop)
+
+
+def _received(loop: asyncio.AbstractEventLoop, number: signal.Signals) -> None:
+    for callback in _leave_signals(loop):
+        callback(f"received {number.name}")
+
+
+def _leave_signals(loop: asyncio.AbstractEventLoop) -> list[StopCallback]:
+    """Give signals their usual effect again; return what they were to call."""
+    for number in _SIGNALS:
+        loop.remove_signal_handler(number)
+    return _callbacks.pop(loop, [])

@@ -6,6 +6,8 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -87,6 +89,45 @@ async def test_signals_are_for_the_process_not_for_a_hosted_node() -> None:
             return signal.getsignal(signal.SIGTERM) is before
 
     assert await HostedProgram([], {}).start(main())
+
+
+async def test_signal_tells_all_nodes_of_a_program_once() -> None:
+    usual = signal.getsignal(signal.SIGTERM)
+    told: list[str] = []
+    with stop_signals(lambda reason: told.append(f"a {reason}")):
+        with stop_signals(lambda reason: told.append(f"b {reason}")):
+            signal.raise_signal(signal.SIGTERM)
+            await until_handled(lambda: told)
+            assert told == ["a received SIGTERM", "b received SIGTERM"]
+            assert signal.getsignal(signal.SIGTERM) is usual
+            with stop_signals(lambda reason: told.append(f"later {reason}")):
+                pass
+        with stop_signals(lambda reason: told.append(f"c {reason}")):
+            signal.raise_signal(signal.SIGINT)
+            await until_handled(lambda: told[2:])
+    assert told[2:] == ["c received SIGINT"], "those of the first signal are told once"
+
+
+async def test_node_that_ends_leaves_signals_to_the_others() -> None:
+    usual = signal.getsignal(signal.SIGTERM)
+    told: list[str] = []
+    with ExitStack() as first, ExitStack() as second:
+        first.enter_context(stop_signals(lambda _: told.append("first")))
+        second.enter_context(stop_signals(lambda _: told.append("second")))
+        first.close()
+        assert signal.getsignal(signal.SIGTERM) is not usual
+        signal.raise_signal(signal.SIGTERM)
+        await until_handled(lambda: told)
+    assert told == ["second"]
+    with stop_signals(lambda _: None):
+        assert signal.getsignal(signal.SIGTERM) is not usual
+    assert signal.getsignal(signal.SIGTERM) is usual
+
+
+async def until_handled(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(10):
+        while not condition():
+            await asyncio.sleep(0)
 
 
 @pytest.mark.parametrize(("word", "code"), [("end", 0), ("fail", 1), ("exit", 3), ("lose", 1)])
