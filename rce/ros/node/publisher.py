@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from rce.ros.tcpros.header import ANY, check_type, encode_header, require
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, MessageType
+
+_log = logging.getLogger(__name__)
 
 Payload = bytes | bytearray | memoryview
 """A serialized message. Large ones are not copied: they must not be changed after they were published."""
@@ -205,7 +208,10 @@ class TopicOutput:
         self.changed.set()
         for publisher in self.publishers:
             if publisher.on_subscriber is not None:
-                publisher.on_subscriber()
+                try:
+                    publisher.on_subscriber()
+                except Exception:  # noqa: BLE001 - the program's own fault: the subscriber is connected
+                    _log.exception("the on_subscriber callback of %s failed", self.topic)
 
 
 class Publisher:
@@ -216,7 +222,8 @@ class Publisher:
     Attributes:
         latch: Whether the last message is given to later subscribers.
         latched: The frames that later subscribers get, by the source that they are of.
-        on_subscriber: Called whenever another subscriber is connected; to be set by the program.
+        on_subscriber: Called whenever another subscriber is connected; to be set by the program. What it
+            raises is logged.
     """
 
     def __init__(

@@ -151,6 +151,29 @@ async def test_timer_awaiting_a_cancelled_task_calls_again(make_node: MakeNode) 
 
 
 @pytest.mark.parametrize("intra_process", [False, True])
+async def test_failing_on_subscriber_callback_connects_once(
+    core: Core, intra_process: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail() -> None:
+        raise RuntimeError("broken callback")
+
+    make = partial(Node, argv=[], master_uri=core.uri, intra_process=intra_process)
+    async with make("a") as a, make("b") as b:
+        failing, other = await a.advertise("t", STRING), await a.advertise("t", STRING)
+        told = asyncio.Event()
+        failing.on_subscriber, other.on_subscriber = fail, told.set
+        subscriber = await b.subscribe("t", STRING)
+        await subscriber.wait_for_publishers(timeout=10)
+        await asyncio.wait_for(told.wait(), 10)
+        for data in ("one", "two"):
+            failing.publish(data=data)
+        assert [(await asyncio.wait_for(anext(subscriber), 10)).data for _ in range(2)] == ["one", "two"]
+        assert failing.connections == 1
+        assert not b.is_shutdown
+    assert "the on_subscriber callback of /t failed" in caplog.text
+
+
+@pytest.mark.parametrize("intra_process", [False, True])
 async def test_iteration_leaves_out_what_is_not_a_message(
     core: Core, intra_process: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
