@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 MIN_RESPAWN_S = 0.1
 """Least pause before a node is started again."""
+RETRY_S = 1.0
+"""Least pause after a node could not be started again."""
 
 
 class StopTimeouts(NamedTuple):
@@ -48,16 +50,24 @@ class LaunchedNode(ABC):
         Cancelling this ends the node at once, with everything that it started.
 
         Raises:
-            OSError: It cannot be started.
+            OSError: It cannot be started for the first time.
         """
-        while True:
-            code = await self._run_once()
-            if self._stopping.is_set() or not self.plan.respawn:
-                return code
+        code, has_run = 0, False
+        while not self._stopping.is_set():
+            pause = max(self.plan.respawn_delay, MIN_RESPAWN_S)
+            try:
+                code = await self._run_once()
+                has_run = True
+            except OSError as error:
+                if not has_run:
+                    raise
+                pause = max(pause, RETRY_S)
+                self._report(f"{self.plan.name}: {describe_failure(error)}; it is tried again in {pause:g} s")
+            if not self.plan.respawn:
+                break
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(self.plan.respawn_delay, MIN_RESPAWN_S)):
-                    await self._stopping.wait()
-                return code
+                await asyncio.wait_for(self._stopping.wait(), pause)
+        return code
 
     def stop(self) -> None:
         """End the node. :meth:`run` then returns."""
@@ -77,6 +87,12 @@ class LaunchedNode(ABC):
         await asyncio.wait((ended, hurrying), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
         hurrying.cancel()
         self._hurrying.clear()
+
+
+def describe_failure(error: OSError) -> str:
+    """Return why a process cannot be started, in words."""
+    where = f": {error.filename}" if error.filename is not None else ""
+    return f"cannot be started: {error.strerror or error}{where}"
 
 
 def describe_end(code: int) -> str:

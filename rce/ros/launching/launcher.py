@@ -14,7 +14,7 @@ from rce.ros.launch.plan import LaunchPlan, NodePlan, Output
 from rce.ros.launching.command import node_command
 from rce.ros.launching.graph import LaunchGraph, launch_graph, wait_for_master
 from rce.ros.launching.hosted import HostedNode, can_host
-from rce.ros.launching.launched import LaunchedNode, StopTimeouts, describe_end
+from rce.ros.launching.launched import LaunchedNode, StopTimeouts, describe_end, describe_failure
 from rce.ros.launching.process import NodeProcess
 from rce.ros.names import segments
 
@@ -98,6 +98,8 @@ class Launcher:
         self._report(f"ROS_MASTER_URI={graph.uri}" + (" (started here)" if graph.is_own else ""))
         folder = await self._make_folder(graph)
         await graph.apply(self._plan)
+        if self._is_told.is_set():
+            return
         for number, plan in enumerate(self._plan.nodes, 1):
             prepared = self._prepare(plan, number, graph, folder)
             if prepared is not None:
@@ -150,7 +152,7 @@ class Launcher:
         try:
             code = await launched.run()
         except OSError as error:
-            self._fail(node, f"cannot be started: {error.strerror}: {error.filename}")
+            self._fail(node, describe_failure(error))
             code = 1
         if node.required and not self._is_told.is_set():
             self._failures += bool(code)

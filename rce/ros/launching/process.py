@@ -73,6 +73,7 @@ class NodeProcess(LaunchedNode):
         command.folder.mkdir(parents=True, exist_ok=True)
         if self._output is None:
             return await _spawn(command, None)
+        self._output.parent.mkdir(parents=True, exist_ok=True)  # rosclean may have removed it
         with self._output.open("ab") as output:
             return await _spawn(command, output.fileno())
 

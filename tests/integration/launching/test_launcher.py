@@ -17,7 +17,13 @@ import pytest
 from support.ports import free_port
 
 from rce.ros.core import Core
+from rce.ros.launch import LaunchPlan
+from rce.ros.launch.exceptions import Place
+from rce.ros.launch.plan import NodePlan
+from rce.ros.launching import Launcher
+from rce.ros.launching.graph import LaunchGraph
 from rce.ros.node import Node
+from rce.ros.packages import PackageIndex
 
 WAIT_S = 90.0
 RCE = str(Path(sys.executable).with_name("rce"))
@@ -177,6 +183,47 @@ async def test_a_node_that_ends_is_started_again(folder: Path) -> None:
         assert sum("/b: started" in line for line in running.lines) == 1
         running.process.send_signal(signal.SIGINT)
         assert await running.code() == 0
+
+
+async def test_respawn_makes_a_purged_log_folder_again(folder: Path) -> None:
+    text = '<node pkg="tools" type="short" name="a" respawn="true" respawn_delay="0.1"/>'
+    async with launched(folder, text) as running:
+        await running.has("/a: started with pid")
+        (folder / "log").rename(folder / "purged")
+        async with asyncio.timeout(WAIT_S):
+            while not list((folder / "log").glob("*/a-1-stdout.log")):
+                await asyncio.sleep(0.05)
+
+
+async def test_respawn_tries_again_when_a_start_fails(folder: Path) -> None:
+    text = '<node pkg="tools" type="short" name="a" respawn="true" respawn_delay="0.1"/>'
+    program = folder / "tools" / "short"
+    async with launched(folder, text) as running:
+        await running.has("/a: started with pid")
+        program.rename(folder / "away")
+        await running.has("/a: cannot be started: No such file or directory", 2)
+        (folder / "away").rename(program)
+        starts = sum("/a: started" in line for line in running.lines)
+        await running.has("/a: started with pid", starts + 1)
+
+
+async def test_stop_while_parameters_are_set_starts_no_node(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    apply = LaunchGraph.apply
+
+    async def stop_meanwhile(graph: LaunchGraph, plan: LaunchPlan) -> None:
+        launcher.stop()
+        await apply(graph, plan)
+
+    monkeypatch.setattr(LaunchGraph, "apply", stop_meanwhile)
+    plan = LaunchPlan([NodePlan("/a", "tools", "sleeper", Place("main.launch", 1))], {"/p": 1})
+    lines: list[str] = []
+    async with Core(port=0) as core:
+        launcher = Launcher(plan, PackageIndex([folder]), core.uri, None, report=lines.append)
+        assert await launcher.run() == 0
+        assert core.get_param("/p") == 1
+    assert lines == [f"ROS_MASTER_URI={core.uri}"]
 
 
 @pytest.mark.parametrize("code", [0, 3])

@@ -176,6 +176,14 @@ async def test_hosted_node_that_waits_is_ended(module: str) -> None:
     assert await running == 0
 
 
+async def test_node_that_is_stopped_before_its_start_never_runs(module: str) -> None:
+    lines: list[str] = []
+    node = HostedNode(plan(respawn=True), command(module, "fail"), lines.append, StopTimeouts())
+    node.stop()
+    assert await node.run() == 0
+    assert lines == []
+
+
 def test_only_modules_without_prefix_are_hosted() -> None:
     found = node_command(
         NodePlan("/amcl", "amcl", "amcl", Place("main.launch", 1)), PackageIndex([]), {}, URI
