@@ -13,6 +13,7 @@ from typing import Annotated, Concatenate, ParamSpec
 import typer
 
 from rce.printable import for_terminal
+from rce.ros import names
 from rce.ros.errors import RosError, ToolError
 from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
@@ -81,10 +82,22 @@ def _run(
         raise typer.Exit(1) from None
 
 
+class _ToolNode(Node):
+    """A node that takes every global name: masters and other nodes know names that are not legal."""
+
+    def resolve(self, name: str) -> str:
+        """Return the global name that ``name`` stands for.
+
+        Raises:
+            InvalidNameError: It is a relative or private name that is not legal.
+        """
+        return names.canonical(name) if names.is_global(name) else super().resolve(name)
+
+
 async def _with_node(work: Callable[[ToolContext], Awaitable[None]]) -> None:
     types = TypeRegistry()
     async with (
-        Node("rce_tool", argv=[], types=types, anonymous=True, signals=True, rosout=False) as node,
+        _ToolNode("rce_tool", argv=[], types=types, anonymous=True, signals=True, rosout=False) as node,
         RpcClient() as rpc,
     ):
         master = MasterClient(uri=node.master_uri, caller=node.name, slave_uri=node.uri, rpc=rpc)

@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from rce.ros import names
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import Message, TypeRegistry
@@ -135,6 +136,28 @@ async def test_services_and_parameters() -> None:
         assert await tool(core, "param", "get", "/a") == "{c: x}\n"
         assert "not set" in await tool(core, "param", "get", "/a/b", code=1)
         assert "is not a value" in await tool(core, "param", "set", "/a", "", code=1)
+
+
+async def test_listed_names_that_are_not_legal_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes of others use such names, and masters take them."""
+    monkeypatch.setattr(names, "is_graph_name", lambda _: True)  # as for nodes of others; not for the tool
+    async with Core("127.0.0.1", 0) as core, Node("camera", argv=[], master_uri=core.uri) as node:
+        publisher = await node.advertise("/camera-1/image", "std_msgs/String", latch=True)
+        publisher.publish(data="hello")
+        await node.advertise_service("/camera-1/on", "std_srvs/Empty", lambda _: {})
+        await node.set_param("/gains/arm-left", 3)
+        assert "/camera-1/image\n" in await tool(core, "topic", "list")
+        assert " * /camera\n" in await tool(core, "topic", "info", "/camera-1/image")
+        assert await tool(core, "topic", "echo", "/camera-1/image", "-n", "1") == "{data: hello}\n---\n"
+        assert await tool(core, "topic", "hz", "/camera-1/image", "-n", "1", "--interval", "0.1")
+        assert await tool(core, "service", "call", "/camera-1/on") == "{}\n"
+        assert await tool(core, "param", "list", "/gains/") == "/gains/arm-left\n"
+        assert await tool(core, "param", "get", "/gains/arm-left") == "3\n"
+        await tool(core, "param", "set", "/gains/arm-left", "4")
+        assert core.get_param("/gains/arm-left") == 4
+        await tool(core, "param", "delete", "/gains/arm-left")
+        assert not await node.has_param("/gains/arm-left")
+        assert "not a legal" in await tool(core, "param", "get", "arm-left", code=1)
 
 
 @pytest.mark.parametrize(
