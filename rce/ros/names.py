@@ -97,7 +97,10 @@ class Arguments:
 
 
 def parse_arguments(argv: Iterable[str]) -> Arguments:
-    """Parse a command line. An argument without a valid name before ``:=`` belongs to the program."""
+    """Parse a command line. An argument without a name before ``:=`` belongs to the program.
+
+    A remapping or attribute without a value is left out, as rospy does; a parameter without one is empty.
+    """
     remappings: dict[str, str] = {}
     specials: dict[str, str] = {}
     parameters: dict[str, str] = {}
@@ -106,10 +109,12 @@ def parse_arguments(argv: Iterable[str]) -> Arguments:
         source, mark, target = argument.partition(REMAP)
         if not mark or not source:
             rest.append(argument)
+        elif source.startswith("_") and not source.startswith("__"):
+            parameters[source[1:]] = target
+        elif not target:
+            continue
         elif source.startswith("__"):
             specials[source] = target
-        elif source.startswith("_"):
-            parameters[source[1:]] = target
         else:
             remappings[source] = target
     return Arguments(remappings, specials, parameters, tuple(rest))

@@ -59,6 +59,12 @@ def test_takes_a_command_line_apart() -> None:
     assert found.rest == ("prog", "--flag", ":=odd")
 
 
+def test_remappings_without_a_target_are_left_out() -> None:
+    """As rospy does: launch files have them where an argument is empty."""
+    found = names.parse_arguments(["prog", "topic:=", "__name:=", "__ns:=", "_gain:="])
+    assert found == names.Arguments({}, {}, {"gain": ""}, ("prog",))
+
+
 @given(st.lists(BASE, max_size=4), BASE, st.lists(BASE, min_size=1, max_size=4))
 def test_resolved_names_are_global_and_stay_as_they_are(
     namespace: list[str], node: str, name: list[str]
