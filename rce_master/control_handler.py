@@ -47,6 +47,7 @@ from rce_master.exceptions import (
 )
 from rce_master.quotas import Quotas
 from rce_master.state import commands
+from rce_master.state.lifecycle import RobotSession
 from rce_master.state.robots import DRAINED
 from rce_master.tokens import Tokens
 
@@ -222,8 +223,11 @@ class ControlHandler:
         if process in self._state_service.tables.drains:
             return LoginReply(request=login.request, status=_UNAVAILABLE, reason=DRAINED)
         try:
-            await self._state_service.submit(await self._admission(process, id_, login))
-            return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))
+            command = await self._admission(process, id_, login)
+            await self._state_service.submit(command)
+            if self._is_admitted(command):
+                return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))
+            status, reason = _UNAVAILABLE, "the robot was sent away while it logged in; connect again"
         except WrongCredentialsError as error:
             status, reason = _UNAUTHORIZED, str(error)
         except TooManyFailuresError as error:
@@ -235,9 +239,17 @@ class ControlHandler:
             self._probe_previous(process, id_)
         except MasterError as error:
             status, reason = _UNAVAILABLE, str(error)
-        except KeyError:
-            status, reason = _UNAVAILABLE, "the robot was removed while it logged in"
         return LoginReply(request=login.request, status=status, reason=reason)
+
+    def _is_admitted(self, command: commands.RobotLogin) -> bool:
+        """Tell whether a login still holds: another command of its batch may have ended it."""
+        tables = self._state_service.tables
+        robot = tables.robot(command.id)
+        return (
+            robot is not None
+            and (robot.task_set, robot.credential) == (command.process, command.credential)
+            and tables.robot_live(command.id).session is RobotSession.CONNECTED
+        )
 
     async def _admission(self, process: str, id_: str, login: Login) -> commands.RobotLogin:
         """Check a robot's credentials; return the command that admits it.

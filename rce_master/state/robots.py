@@ -170,6 +170,15 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
     tx.put(replace(live, status=status))
 
 
+def reported_elsewhere(tx: Transaction, process: str, status: EndpointStatus) -> None:
+    """Have a task set drop a robot that it reports as connected, and that is not placed there.
+
+    It was sent away while the answer to its login was under way, so its task set made it afterwards.
+    """
+    if status.state is EndpointState.RUNNING:
+        tx.withdraw(process, status.id, "the robot was sent away while it logged in; connect again")
+
+
 def expire(tx: Transaction) -> None:
     """Remove the robots whose grace time is over, and give up those that were let in and never came."""
     for live in tx.tables.live.by("unsettled", WAITING):

@@ -188,10 +188,7 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
 
 
 def status_reported(tx: Transaction, command: StatusReported) -> None:
-    """Apply a task set's report about one endpoint; ignore it if the endpoint is not placed there.
-
-    So is what comes from a task set after its channel ended.
-    """
+    """Apply a task set's report about one endpoint; ignore one that comes after the end of its channel."""
     if not tx.tables.is_connected(command.process):
         return
     endpoint = tx.tables.endpoints.get(command.status.id)
@@ -201,7 +198,7 @@ def status_reported(tx: Transaction, command: StatusReported) -> None:
     elif move is not None and move.to == command.process:
         draining.reported(tx, move, command.status)
     else:
-        handing_over.departing_reported(tx, command.process, command.status)
+        _reported_elsewhere(tx, command.process, command.status)
 
 
 def status_patched(tx: Transaction, command: StatusPatched) -> None:
@@ -222,7 +219,17 @@ def status_patched(tx: Transaction, command: StatusPatched) -> None:
         else:
             tx.changes.wanted_statuses.append((process, id_))
     else:
-        handing_over.departing_reported(tx, process, patch.status, patch)
+        _reported_elsewhere(tx, process, patch.status, patch)
+
+
+def _reported_elsewhere(
+    tx: Transaction, process: str, status: EndpointStatus, patch: StatusPatch | None = None
+) -> None:
+    """Apply a report about an endpoint by a task set where it is not placed."""
+    if tx.tables.task_sets[process].kind is TaskSetKind.ROBOT:
+        robots.reported_elsewhere(tx, process, status)
+    else:
+        handing_over.departing_reported(tx, process, status, patch)
 
 
 def _follows(patch: StatusPatch, known: EndpointStatus | None) -> bool:

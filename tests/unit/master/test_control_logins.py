@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 from support.master_cloud import PASSWORD, Cloud, wire
 
 from rce.control.messages import (
@@ -15,6 +17,10 @@ from rce.control.messages import (
 )
 from rce.model import AddNode, ConfigureComponents, CreateContainer, NodeSpec, RemoveInterface, Resources
 from rce_master.auth import client_digest
+from rce_master.state import commands
+from rce_master.state.lifecycle import RobotSession
+from rce_master.state.user_records import User, UserRole
+from rce_master.tokens import new_token
 
 
 async def test_a_logins_answer_carries_the_spec_and_no_put_precedes_it(cloud: Cloud) -> None:
@@ -67,6 +73,27 @@ async def test_robot_leaving_during_login_is_disconnected(cloud: Cloud) -> None:
     await robots.say(Left(id="anna/rob", reason="gone"))
     await robots.get(LoginReply)
     assert (await robots.login()).status == 200
+
+
+async def test_robot_sent_away_while_logging_in_is_refused(cloud: Cloud) -> None:
+    """The command that ends the session is done in the same batch as the login, so before its answer."""
+    robots = cloud.robots()
+    await robots.hello()
+    token, record = new_token("anna", "", 0.0, 0.0, scope="robot:rob")
+    await cloud.state_service.submit(commands.AddToken(token=record))
+    cloud.store.free.clear()
+    bob = User(name="bob", role=UserRole.USER, password="", created=0.0)
+    written = await cloud.state_service.enqueue([commands.AddUser(user=bob)])
+    await asyncio.sleep(0)
+    await robots.say(Login(request=1, user="anna", robot="rob", password="", token=token))
+    await asyncio.sleep(0)
+    revoked = await cloud.state_service.enqueue([commands.RevokeRobotToken(user="anna", robot="rob")])
+    cloud.store.free.set()
+    assert [await written, await revoked] == [[None], [None]]
+    reply = await robots.get(LoginReply)
+    assert (reply.status, reply.endpoint) == (503, None)
+    assert "sent away while it logged in" in reply.reason
+    assert cloud.state_service.tables.robot_live("anna/rob").session is RobotSession.ABSENT
 
 
 async def test_every_bad_item_is_told_and_the_others_are_done(cloud: Cloud) -> None:

@@ -8,7 +8,9 @@ from support.state_reports import kinds, status
 
 from rce.control.model import (
     EndpointState,
+    EndpointStatus,
     LinkAddress,
+    StatusPatch,
 )
 from rce_master.exceptions import ConflictError
 from rce_master.state import commands
@@ -161,3 +163,34 @@ def test_a_new_password_ends_the_sessions_of_the_users_robots(world: World) -> N
     assert after.revision > changes.withdrawals[0].revision
     assert (after.interfaces, after.connections) == (before.interfaces, before.connections)
     assert world.session() == "connected"
+
+
+@pytest.mark.parametrize("in_patch", [False, True])
+def test_robot_connected_where_it_is_not_placed_is_dropped(world: World, in_patch: bool) -> None:
+    """It was sent away before its task set had the answer to its login."""
+    world.wired()
+    world.robot_set("r2")
+
+    def report(process: str, state: EndpointState, id_: str = "anna/rob") -> list[tuple[str, str]]:
+        there = EndpointStatus(id=id_, revision=1, state=state, number=7)
+        command = (
+            commands.StatusPatched(process=process, patch=StatusPatch(status=there))
+            if in_patch
+            else commands.StatusReported(process=process, status=there)
+        )
+        changes = world.do(command)
+        for drop in changes.withdrawals:
+            assert drop.revision > world.spec("rob").revision
+        return [(drop.process, drop.id) for drop in changes.withdrawals]
+
+    assert report("r1", EndpointState.RUNNING) == []
+    assert report("r2", EndpointState.RUNNING) == [("r2", "anna/rob")]
+    assert report("r2", EndpointState.ABSENT) == []
+    assert report("r2", EndpointState.RUNNING, "anna/removed") == [("r2", "anna/removed")]
+    assert report("c1", EndpointState.RUNNING) == []
+    world.leave("r2")
+    assert report("r2", EndpointState.RUNNING) == []
+    assert world.session() == "connected"
+    world.do(commands.SetPassword(name="anna", password="new"))
+    assert report("r1", EndpointState.RUNNING) == [("r1", "anna/rob")]
+    assert world.session() == "absent"
