@@ -108,6 +108,8 @@ class RobotTaskSet:
         self._channel: MasterChannel
         self._namespaces: dict[EndpointId, Namespace] = {}
         self._closing: dict[EndpointId, asyncio.Event] = {}
+        self._admitted: dict[EndpointId, int] = {}
+        """Revisions of the robots' logins since the last ``Hello``: answers overtake messages that wait."""
         self._changed: set[Namespace] = set()
         self._lobby = lobby
         self._pool = pool
@@ -128,6 +130,7 @@ class RobotTaskSet:
     def hello(self) -> Hello:
         """Return the task set's name, machine and robots."""
         self._master_features = frozenset()
+        self._admitted.clear()
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.ROBOT,
@@ -146,18 +149,13 @@ class RobotTaskSet:
             case Welcome():
                 self._master_features = frozenset(message.features)
             case Put():
-                await self.settle(message.endpoint)
+                await self._apply(message.endpoint)
             case PatchSpec():
                 await self._patch(message.patch)
             case StatusWanted():
                 self._report_whole(EndpointId.parse(message.id))
             case Drop():
-                self._drop(
-                    EndpointId.parse(message.id),
-                    message.reason or "removed",
-                    message.revision,
-                    elsewhere=message.elsewhere,
-                )
+                self._take_drop(message)
             case Sync():
                 await self._sync(message.endpoints)
             case Notify():
@@ -224,7 +222,18 @@ class RobotTaskSet:
         return self._namespaces.get(id)
 
     async def settle(self, spec: EndpointSpec) -> Namespace:
-        """Return the robot's namespace with the spec applied; make it if it does not exist."""
+        """Return the robot's namespace with the spec of its login applied; make it if it does not exist.
+
+        Raises:
+            HandshakeError: The master had the robot dropped meanwhile.
+        """
+        namespace = await self._apply(spec, logs_in=True)
+        if not self._is_current(namespace):
+            reason = "The robot was sent away while it logged in; connect again."
+            raise HandshakeError(_UNAVAILABLE, reason)
+        return namespace
+
+    async def _apply(self, spec: EndpointSpec, *, logs_in: bool = False) -> Namespace:
         id_ = EndpointId.parse(spec.id)
         while (closing := self._closing.get(id_)) is not None:
             await closing.wait()
@@ -240,6 +249,8 @@ class RobotTaskSet:
                 ledger=self._ledger,
                 pool=self._pool,
             )
+        if logs_in and namespace.session is None:
+            self._admitted[id_] = spec.revision
         await namespace.apply(spec)
         return namespace
 
@@ -321,14 +332,25 @@ class RobotTaskSet:
     async def _sync(self, specs: tuple[EndpointSpec, ...]) -> None:
         wanted = {spec.id for spec in specs}
         for id_ in list(self._namespaces):
-            if str(id_) not in wanted:
+            if str(id_) not in wanted and id_ not in self._admitted:
                 self._drop(id_, "the master does not know this robot any more", 0)
         for spec in specs:
-            await self.settle(spec)
+            await self._apply(spec)
+
+    def _take_drop(self, drop: Drop) -> None:
+        """Close a robot's namespace, unless the robot has logged in since the master sent the message."""
+        id_ = EndpointId.parse(drop.id)
+        if drop.revision >= self._admitted.get(id_, 0):
+            self._drop(id_, drop.reason or "removed", drop.revision, elsewhere=drop.elsewhere)
 
     def _drop(self, id_: EndpointId, reason: str, revision: int, *, elsewhere: bool = False) -> None:
         """Start to close a robot's namespace; report its end to the master."""
-        namespace = self._namespaces.pop(id_, None)
+        namespace = self._namespaces.get(id_)
+        if namespace is not None and namespace.session is not None:
+            # A login that was answered meanwhile and refused here made the master take it for connected.
+            self.robot_left(namespace, reason)
+        self._namespaces.pop(id_, None)
+        self._admitted.pop(id_, None)
         if namespace is None or self._tasks is None:
             self._channel.send(Gone(id=str(id_), revision=revision))
             return

@@ -321,7 +321,10 @@ class StatusWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """One endpoint is no longer desired here. Answered by :class:`Gone`."""
+    """One endpoint is no longer desired here. Answered by :class:`Gone`.
+
+    Ignored for a robot whose login is newer: :class:`LoginReply` may overtake it in the task set.
+    """
 
     id: str
     revision: int

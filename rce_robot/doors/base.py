@@ -45,7 +45,11 @@ class Admission(Protocol):
         """Return the robot's namespace if it exists."""
 
     async def settle(self, spec: EndpointSpec) -> Namespace:
-        """Return the robot's namespace with the spec applied."""
+        """Return the robot's namespace with the spec of its login applied.
+
+        Raises:
+            HandshakeError: The robot was sent away meanwhile.
+        """
 
 
 class DoorSession(Protocol):
