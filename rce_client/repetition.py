@@ -28,7 +28,6 @@ class Repetition:
         repeat: Sends all requests again.
         on_dropped: Called with the number of drops before they are repeated, not with each: a program that
             makes a thousand interfaces would fill its log.
-        on_taken: Called when the engine has taken all of them.
     """
 
     def __init__(
@@ -36,12 +35,10 @@ class Repetition:
         spawn: Callable[[Coroutine[object, object, None]], asyncio.Task[None]],
         repeat: Callable[[], Awaitable[None]],
         on_dropped: Callable[[int], None],
-        on_taken: Callable[[], None],
     ) -> None:
         self._spawn = spawn
         self._repeat = repeat
         self._on_dropped = on_dropped
-        self._on_taken = on_taken
         self._task: asyncio.Task[None] | None = None
         self._dropped = 0
 
@@ -59,4 +56,3 @@ class Repetition:
             self._on_dropped(dropped)
             await self._repeat()
             await asyncio.sleep(CALM_S)
-        self._on_taken()

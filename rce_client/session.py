@@ -127,11 +127,9 @@ class Session:
         oldest first."""
         self._received: deque[tuple[float, Request]] = deque(maxlen=MAX_RECEIVED)
         """Those that the engine received lately, and when; oldest first."""
-        self._maybe_dropped: deque[Request] = deque(maxlen=MAX_RECEIVED)
-        """Those that it may have dropped, until it has taken all requests; oldest first."""
-        self._repetition = Repetition(
-            self.spawn, self._repeat_all, self._tell_dropped, self._maybe_dropped.clear
-        )
+        self._maybe_dropped: dict[object, Request] = {}
+        """Those that it may have dropped, until they are sent again; oldest first."""
+        self._repetition = Repetition(self.spawn, self._repeat_all, self._tell_dropped)
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
@@ -304,6 +302,7 @@ class Session:
 
     def on_lost(self, error: LostError) -> None:
         """Learn that the connection broke."""
+        self._reclaim()
         self.interfaces.lose()
         self._happen(ConnectionEvent.LOSE, str(error))
 
@@ -355,7 +354,8 @@ class Session:
 
     def _confirm(self, key: object) -> None:
         """Learn that the engine received a request that no restoring repeats."""
-        if (request := self._unconfirmed.pop(key, None)) is not None:
+        request = self._unconfirmed.pop(key, None)
+        if request is not None and key not in self._maybe_dropped:
             self._received.append((asyncio.get_running_loop().time(), request))
 
     def _take_drop(self) -> None:
@@ -364,18 +364,31 @@ class Session:
         No older removal is repeated: another program may have made a thing of that name since.
         """
         since = asyncio.get_running_loop().time() - REPORTED_WITHIN_S
-        self._maybe_dropped.extend(request for at, request in self._received if at >= since)
+        self._maybe_dropped.update((object(), request) for at, request in self._received if at >= since)
         self._received.clear()
-        self._maybe_dropped.extend(self._unconfirmed.values())
+        self._maybe_dropped.update(self._unconfirmed)
         self._repetition.note_drop()
+
+    def _reclaim(self) -> dict[object, Request]:
+        """Count what the engine may have dropped as not received, in few requests; return these."""
+        for key in self._maybe_dropped:
+            self._unconfirmed.pop(key, None)
+        again: dict[object, Request] = {
+            object(): part
+            for request in merge_removals(self._maybe_dropped.values())
+            for part in parts_of(request)
+        }
+        self._maybe_dropped.clear()
+        self._unconfirmed = again | self._unconfirmed
+        return again
 
     async def _repeat_all(self) -> None:
         """Send all requests again that the engine may have dropped; after a reconnect, what is desired."""
         if self._refusal is not None:
             return
-        for request in merge_removals(self._maybe_dropped):
-            for part in parts_of(request):
-                self.transport.deliver(encode(part)).add_done_callback(_take_note)
+        for key, request in self._reclaim().items():
+            sent = self.transport.deliver(encode(request), partial(self._confirm, key))
+            sent.add_done_callback(_take_note)
         await self.repeat()
 
     def _take_fault(self, fault: Fault) -> None:

@@ -15,6 +15,7 @@ from support.client_types import ECHO, STRING, ros_string
 from support.cloud import PASSWORD, content_of, running_cloud
 from support.slow_link import SlowLink
 
+from rce.aio.backoff import Backoff
 from rce.model import ConfigureComponents, ConfigureConnections
 from rce.model import Connection as ConnectionSpec
 from rce.protocol import MAX_ITEMS
@@ -68,6 +69,42 @@ async def test_requests_that_a_busy_engine_drops_are_repeated(door: Door) -> Non
             await engine.wait_errors(conn, "because the engine is busy")
             gate.set()
             await engine.master.changed.until(lambda: made == set(tags[15:]))
+
+
+@pytest.mark.parametrize("is_repeated", [False, True])
+async def test_removal_dropped_before_an_outage_is_repeated(
+    door: Door, monkeypatch: pytest.MonkeyPatch, is_repeated: bool
+) -> None:
+    """The connection breaks before its repetition, or before that arrives."""
+    monkeypatch.setattr("rce_client.repetition.PAUSES", Backoff(first=3600.0, longest=3600.0))
+    async with running_cloud(SessionSettings(max_requests=2, drain_timeout=1.0)) as cloud:
+        engine = Engine(cloud, door)
+        gate = asyncio.Event()
+
+        async def answer(_: ClientRequest) -> tuple[str, ...]:
+            await gate.wait()
+            return ()
+
+        engine.master.answer = answer
+        async with asyncio.timeout(60), engine.connection() as conn:
+            await conn.create_container("c0")
+            await engine.master.changed.until(lambda: len(engine.master.requests) == 1)
+            for tag in ("c1", "c2"):
+                await conn.create_container(tag)  # they wait in the engine, which takes nothing more now
+            await conn.destroy_container("old")
+            session = conn._session
+            while session._unconfirmed or not session._maybe_dropped:
+                await asyncio.sleep(0.01)
+            engine.stop_reading()
+            if is_repeated:
+                await session._repeat_all()
+            gate.set()
+            engine.door.status = 503
+            await engine.kick()
+            engine.master.requests.clear()
+            engine.door.status = 200
+            await engine.master.changed.until(lambda: engine.master.requests)
+        assert engine.master.requests[0] == ("testUser/testRobot", "DC", {"containerTag": "old"})
 
 
 async def test_requests_that_were_dropped_are_told_together(
