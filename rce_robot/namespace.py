@@ -131,15 +131,16 @@ class Namespace:
         self._changed()
         return True
 
-    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
+    async def close(self, reason: str, *, elsewhere: bool = False, finishes: bool = False) -> None:
         """End the connection, if any, and remove all interfaces.
 
         Args:
             reason: For the robot.
             elsewhere: Whether the robot is to connect again, at another task set.
+            finishes: Whether the requests that it has sent are carried out; else they are forgotten.
         """
         if self.session is not None:
-            await self.session.close(reason, elsewhere=elsewhere)
+            await self.session.close(reason, elsewhere=elsewhere, finishes=finishes)
         async with self._applying:
             await self._endpoint.close()
         self._account.close()

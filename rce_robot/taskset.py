@@ -359,7 +359,8 @@ class RobotTaskSet:
 
     async def _close(self, namespace: Namespace, reason: str, revision: int, *, elsewhere: bool) -> None:
         try:
-            await _end(namespace, reason, elsewhere=elsewhere)
+            # Its next task set knows of none of them, and its client repeats none that was received.
+            await _end(namespace, reason, elsewhere=elsewhere, finishes=elsewhere)
         finally:
             self._closing.pop(namespace.id).set()
         self._channel.send(Gone(id=str(namespace.id), revision=revision))
@@ -370,8 +371,8 @@ class RobotTaskSet:
                 namespace.report(message.text)
 
 
-async def _end(namespace: Namespace, reason: str, *, elsewhere: bool) -> None:
+async def _end(namespace: Namespace, reason: str, *, elsewhere: bool, finishes: bool = False) -> None:
     try:
-        await namespace.close(reason, elsewhere=elsewhere)
+        await namespace.close(reason, elsewhere=elsewhere, finishes=finishes)
     except Exception:  # noqa: BLE001 - logged; it must not end anything else
         _log.exception("closing robot %s", namespace.id)

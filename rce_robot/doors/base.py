@@ -73,8 +73,11 @@ class DoorSession(Protocol):
     def fail(self, reason: str) -> None:
         """Drop the connection."""
 
-    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
-        """End the connection, and tell the robot why, and if so that it can connect elsewhere."""
+    async def close(self, reason: str, *, elsewhere: bool = False, finishes: bool = False) -> None:
+        """End the connection, and tell the robot why, and if so that it can connect elsewhere.
+
+        The requests that the robot has sent are carried out if ``finishes``, and forgotten if not.
+        """
 
     async def probe(self) -> bool:
         """End the connection unless the robot answers; return whether it does."""

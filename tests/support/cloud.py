@@ -217,10 +217,11 @@ class FakeMaster:
         elif self.peer is not None:
             self.peer.send(Put(endpoint=spec))
 
-    def drop(self, id_: str, reason: str) -> None:
+    def drop(self, id_: str, reason: str, *, elsewhere: bool = False) -> None:
         assert self.peer is not None
         self.inside.discard(id_)
-        self.peer.send(Drop(id=id_, revision=self.specs.pop(id_).revision, reason=reason))
+        revision = self.specs.pop(id_).revision
+        self.peer.send(Drop(id=id_, revision=revision, reason=reason, elsewhere=elsewhere))
 
     def running(self, id_: str) -> bool:
         status = self.statuses.get(id_)

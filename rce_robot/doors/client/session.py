@@ -129,15 +129,17 @@ class Session:
             self._tasks = None
             self._end()
 
-    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
-        """Close the connection, forget the robot's requests and wait until the session has ended.
+    async def close(self, reason: str, *, elsewhere: bool = False, finishes: bool = False) -> None:
+        """Close the connection and wait until the session has ended.
 
         Args:
             reason: For the robot.
             elsewhere: Whether the robot is to connect again, at another task set.
+            finishes: Whether the requests that it has sent are carried out; else they are forgotten.
         """
         code = CloseCode.GOING_AWAY if elsewhere else CloseCode.POLICY_VIOLATION
-        self._drain_timeout = 0.0
+        if not finishes:
+            self._drain_timeout = 0.0
         await self._socket.close(code, reason[:MAX_REASON])
         await self.ended.wait()
 

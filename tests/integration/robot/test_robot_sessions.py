@@ -341,6 +341,36 @@ async def test_a_dropped_robot_is_told_why_and_is_gone(cloud: Cloud, robot: Robo
     await cloud.master.changed.until(lambda: ROBOT in cloud.master.gone)
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+async def test_requests_of_a_robot_that_is_sent_elsewhere(
+    dial: Dial, robot_of: type[Robot], elsewhere: bool
+) -> None:
+    """They are carried out: its client takes them for done. Those of a robot that is removed are not."""
+    async with running_cloud(SessionSettings(drain_timeout=60.0)) as cloud, dial(cloud) as socket:
+        asked, released = asyncio.Event(), asyncio.Event()
+
+        async def wait(_: object) -> tuple[str, ...]:
+            asked.set()
+            await released.wait()
+            return ()
+
+        cloud.master.answer = wait
+        robot = robot_of(socket)
+        for number in range(3):
+            await robot.send("DC", {"containerTag": f"c{number}"})
+        await (await socket.ping())
+        await asked.wait()
+        cloud.master.drop(ROBOT, "connect again", elsewhere=elsewhere)
+        with pytest.raises(ConnectionClosed):
+            await robot.get("nothing")
+        if elsewhere:
+            released.set()  # the connection ended before
+        await cloud.master.changed.until(lambda: ROBOT in cloud.master.gone)
+        told = [data["containerTag"] for _, _, data in cloud.master.requests]
+        assert told == (["c0", "c1", "c2"] if elsewhere else ["c0"])
+        released.set()
+
+
 # Abuse
 
 

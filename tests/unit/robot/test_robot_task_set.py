@@ -77,7 +77,7 @@ class Connected:
     def __init__(self) -> None:
         self.closed = ""
 
-    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
+    async def close(self, reason: str, *, elsewhere: bool = False, finishes: bool = False) -> None:
         self.closed = reason
 
 
