@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import assert_never
+
 from msgspec import Struct
 
 from rce.control import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch, ToMaster
+from rce.control import messages as m
 
 
 class Put(Struct, frozen=True):
@@ -169,3 +172,20 @@ class Tell(Struct, frozen=True):
 
 
 Instruction = Start | Apply | ApplyPatch | Stop | Wait | Tell
+
+
+def event_of(message: m.Put | m.PatchSpec | m.StatusWanted | m.Drop | m.Sync) -> Event:
+    """Return what a message of the master means for the containers."""
+    match message:
+        case m.Put(endpoint=spec):
+            return Put(spec)
+        case m.PatchSpec(patch=patch):
+            return Patch(patch)
+        case m.StatusWanted(id=id_):
+            return StatusWanted(id_)
+        case m.Drop(id=id_, revision=revision, reason=reason):
+            return Drop(id_, revision, reason)
+        case m.Sync(endpoints=specs):
+            return Sync(specs)
+        case _:
+            assert_never(message)

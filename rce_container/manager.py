@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from typing import TYPE_CHECKING, assert_never
 
 from rce.control import (
@@ -208,10 +208,11 @@ class Manager:
             case Welcome():
                 self._learn(message)
             case Put() | PatchSpec() | StatusWanted() | Drop() | Sync():
-                self._feed(_event_of(message))
+                self._feed(events.event_of(message))
             case ReadLog():
                 self._log_reads.take(message)
             case RemoveVolume(volume=volume):
+                self._withdraw_orders([volume])  # a volume that is being restored is not wanted any more
                 self._keeper.remove(volume)
             case SaveVolume() if self._snapshots is not None:
                 self._snapshots.save(message)
@@ -294,6 +295,8 @@ class Manager:
                 snapshots = self._tasks.create_task(self._take_snapshots(), name="snapshots")
                 pruning = self._tasks.create_task(self._former.prune_logs(), name="old logs")
                 await quit_.wait()
+                if self._snapshots is not None:
+                    await self._snapshots.close()  # this machine is not to be given a container any more
                 await asyncio.gather(*(one.save_states() for one in self._incarnations.values()))
                 self._feed(events.Quit())
                 self._start_waiting()
@@ -379,6 +382,10 @@ class Manager:
         return container is None or container.phase is not Phase.STARTING
 
     def _start(self, id_: str) -> None:
+        user, resources = EndpointId.parse(id_).user, self._core.resources(id_)
+        if orders := self._withdraw_orders([f"{user}/{volume.name}" for volume in resources.volumes]):
+            self._spawn(self._start_after(orders, id_), name=f"wait for volumes of {id_}")
+            return
         try:
             folder = self._state.create(id_)
         except StateError as error:
@@ -386,7 +393,7 @@ class Manager:
             return
         try:
             handle, control_group, isolated = self._launcher.launch(
-                id_, folder, self._core.resources(id_), self._core.placements(id_)
+                id_, folder, resources, self._core.placements(id_)
             )
         except (ContainerError, OSError) as error:  # disk, descriptors or memory are exhausted
             self._spawn(self._undo(id_, folder.incarnation_id, str(error)), name=f"what was made of {id_}")
@@ -398,12 +405,21 @@ class Manager:
         self._tasks.create_task(self._await_start(incarnation), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.incarnation_id, self._address(folder)))
 
-    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
-        self._tasks.create_task(work, name=name)
+    def _spawn(self, work: Coroutine[None, None, None], name: str) -> asyncio.Task[None]:
+        return self._tasks.create_task(work, name=name)
 
     async def _take_snapshots(self) -> None:
         if self._snapshots is not None:
             await self._snapshots.run(self._incarnations)
+
+    def _withdraw_orders(self, volumes: Iterable[str]) -> list[asyncio.Task[None]]:
+        return self._snapshots.withdraw(volumes) if self._snapshots is not None else []
+
+    async def _start_after(self, orders: list[asyncio.Task[None]], id_: str) -> None:
+        """Start a container whose volumes are still held by orders of a move that was given up."""
+        await asyncio.wait(orders)
+        self._queue.put(id_)
+        self._start_waiting()
 
     async def _undo(self, id_: str, incarnation_id: str, error: str) -> None:
         """Remove what was made of a container that cannot be started; only then it is tried again."""
@@ -478,19 +494,3 @@ class Manager:
             usage = await asyncio.to_thread(self._meter.measure, wanted)
             held = dict(self._volumes.used)
             self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage, volumes=held))
-
-
-def _event_of(message: Put | PatchSpec | StatusWanted | Drop | Sync) -> events.Event:
-    match message:
-        case Put(endpoint=spec):
-            return events.Put(spec)
-        case PatchSpec(patch=patch):
-            return events.Patch(patch)
-        case StatusWanted(id=id_):
-            return events.StatusWanted(id_)
-        case Drop(id=id_, revision=revision, reason=reason):
-            return events.Drop(id_, revision, reason)
-        case Sync(endpoints=specs):
-            return events.Sync(specs)
-        case _:
-            assert_never(message)

@@ -57,11 +57,31 @@ async def in_own_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwa
     return await _await_end(work)
 
 
+async def make_in_thread(make: Callable[[], R], undo: Callable[[R], object]) -> R:
+    """Do the same as :func:`in_thread` for what has to be closed or removed.
+
+    Args:
+        make: Blocks.
+        undo: Is called with the result if the caller was cancelled meanwhile. Quick.
+    """
+    work = asyncio.ensure_future(asyncio.to_thread(make))
+    try:
+        return await _await_end(work)
+    except asyncio.CancelledError:
+        if not work.cancelled() and work.exception() is None:
+            undo(work.result())
+        raise
+
+
 async def _await_end(work: asyncio.Future[R]) -> R:
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
-        await asyncio.wait([work])
+        while not work.done():
+            with contextlib.suppress(asyncio.CancelledError):  # one more does not end the thread either
+                await asyncio.wait([work])
+        if not work.cancelled():
+            work.exception()  # noted as seen: a thread that was told to stop may say so
         raise
 
 

@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 from rce.aio.tasks import TaskScope
 from rce.control import (
@@ -27,7 +27,7 @@ from rce.guard.turns import CrowdedError, Turns
 from rce_container.exceptions import VolumeError
 from rce_container.files import remove
 from rce_container.folder import make_accessible
-from rce_container.packages.disk import in_own_thread
+from rce_container.packages.disk import in_own_thread, in_thread, make_in_thread
 from rce_container.volumes import tree
 from rce_container.volumes.freezing import frozen
 from rce_container.volumes.tree import Allowance, Pieces
@@ -71,6 +71,13 @@ class Subject(Protocol):
         """All of its processes, as the machine sees them."""
 
 
+class _Order(NamedTuple):
+    """An order of the master that is being carried out."""
+
+    message: SaveVolume | RestoreVolume
+    task: asyncio.Task[None]
+
+
 class SnapshotKeeper:
     """Saves and restores volumes.
 
@@ -90,7 +97,7 @@ class SnapshotKeeper:
         self,
         store: VolumeStore,
         send: Callable[[ToMaster], None],
-        spawn: Callable[..., object],
+        spawn: Callable[..., asyncio.Task[None]],
         release: Callable[[str], None],
         *,
         uploader: Uploader,
@@ -102,8 +109,9 @@ class SnapshotKeeper:
         self._release = release
         self._uploader = uploader
         self._fetch = fetch
-        self._busy: set[tuple[str, str]] = set()
-        """Kind and volume of the orders that are being carried out."""
+        self._orders: dict[str, _Order] = {}
+        """The newest order for each volume; it may be done."""
+        self._closed = False
         self._due: dict[tuple[str, str], float] = {}
         """When the next snapshot is taken, by incarnation and volume; seconds of the monotonic clock."""
         self._taken: set[tuple[str, str]] = set()
@@ -117,24 +125,39 @@ class SnapshotKeeper:
 
     def save(self, order: SaveVolume) -> None:
         """Send a volume whose container has ended; answers with ``VolumeSaved``."""
-        self._begin("save", order.volume, self._save(order))
+        self._begin(order, self._save(order))
 
     def restore(self, order: RestoreVolume) -> None:
         """Make a volume from a snapshot; answers with ``VolumeRestored``."""
-        self._begin("restore", order.volume, self._restore(order))
+        self._begin(order, self._restore(order))
 
-    def _begin(self, kind: str, id_: str, work: Coroutine[None, None, None]) -> None:
-        async def carry_out() -> None:
-            try:
-                await work
-            finally:
-                self._busy.discard((kind, id_))
+    def withdraw(self, volumes: Iterable[str]) -> list[asyncio.Task[None]]:
+        """Give up the orders for volumes, which are then not answered.
 
-        if (kind, id_) in self._busy:  # it was asked for again after a pause, and is answered at its end
+        Returns:
+            Tasks that are ending; each holds its volume until it has ended.
+        """
+        orders = [self._orders.pop(id_) for id_ in volumes if id_ in self._orders]
+        tasks = [order.task for order in orders if not order.task.done()]
+        for task in tasks:
+            task.cancel()
+        return tasks
+
+    async def close(self) -> None:
+        """Give up all orders, and refuse those that come later."""
+        self._closed = True
+        if tasks := self.withdraw(list(self._orders)):
+            await asyncio.wait(tasks)
+
+    def _begin(self, message: SaveVolume | RestoreVolume, work: Coroutine[None, None, None]) -> None:
+        former = self._orders.get(message.volume)
+        is_repeated = former is not None and former.message == message and not former.task.done()
+        if self._closed or is_repeated:  # an order that comes again is answered at the end of the first one
             work.close()
             return
-        self._busy.add((kind, id_))
-        self._spawn(carry_out(), name=f"{kind} volume {id_}")
+        self.withdraw([message.volume])  # of an earlier move, which the master has given up
+        task = self._spawn(work, name=f"{type(message).__name__} {message.volume}")
+        self._orders[message.volume] = _Order(message, task)
 
     async def _save(self, order: SaveVolume) -> None:
         saved = VolumeSaved(volume=order.volume, placement=order.placement, is_last=True)
@@ -150,7 +173,7 @@ class SnapshotKeeper:
         async with self._held(order.volume):
             if self._store.places.placement(order.volume) < order.placement:
                 raise SnapshotError("its files are not on this machine")
-            root = await asyncio.to_thread(self._store.places.open, order.volume)
+            root = await self._open(order.volume)
             try:
                 return await self._send_tree(order.volume, root, _size_of(root))
             finally:
@@ -170,31 +193,33 @@ class SnapshotKeeper:
     async def _restore_held(self, order: RestoreVolume) -> None:
         async with self._held(order.volume):
             manifest = decode_manifest(await self._whole(order.snapshot, MAX_MANIFEST))
-            new, root = await asyncio.to_thread(self._store.places.make_new, order.size)
+            new, root = await make_in_thread(lambda: self._store.places.make_new(order.size), _discard)
             try:
                 try:
                     async with self._former(order.volume) as former:
                         await tree.write(manifest, root, lambda sha256: self._piece(sha256, former))
                 finally:
                     os.close(root)
-                await asyncio.to_thread(
-                    self._store.replace, order.volume, new, order.placement, order.snapshot
-                )
+                await in_thread(self._store.replace, order.volume, new, order.placement, order.snapshot)
             finally:
-                await asyncio.to_thread(_remove, new)
+                await in_thread(_remove, new)
+
+    async def _open(self, id_: str) -> int:
+        """Open a volume that no container has (:meth:`VolumePlaces.open`)."""
+        return await make_in_thread(lambda: self._store.places.open(id_), os.close)
 
     @contextlib.asynccontextmanager
     async def _former(self, id_: str) -> AsyncIterator[Pieces | None]:
         """Open the files of an earlier placement, to use pieces of them again; None if there are none."""
         try:
-            root = await asyncio.to_thread(self._store.places.open, id_)
+            root = await self._open(id_)
         except VolumeError:
             yield None
             return
         try:
             pieces = None
             try:
-                pieces = Pieces(root, await in_own_thread(tree.scan, root, Allowance(_size_of(root))))
+                pieces = Pieces(root, await in_own_thread(tree.scan, root, _allowance(_size_of(root))))
             except (SnapshotError, OSError) as error:
                 _log.info("former files of volume %s are of no use: %s", id_, error)
             yield pieces
@@ -204,7 +229,7 @@ class SnapshotKeeper:
     async def _piece(self, sha256: str, former: Pieces | None) -> bytes:
         if former is not None and sha256 in former:
             with contextlib.suppress(SnapshotError, OSError):  # then it is fetched
-                return await asyncio.to_thread(former.read, sha256)
+                return await in_thread(former.read, sha256)
         return await self._whole(sha256, MAX_MANIFEST)
 
     async def _whole(self, sha256: str, most: int) -> bytes:
@@ -257,7 +282,7 @@ class SnapshotKeeper:
 
     async def _send_tree(self, id_: str, root: int, size: int) -> str:
         """Send a snapshot of a volume that may hold so many bytes; return its hash, in hex."""
-        manifest = await in_own_thread(tree.scan, root, Allowance(size))
+        manifest = await in_own_thread(tree.scan, root, _allowance(size))
         listed = manifest.encode()
         name = hashlib.sha256(listed).hexdigest()
         failures = 0
@@ -277,7 +302,7 @@ class SnapshotKeeper:
         offer = Offer(volume=id_, contents=[name, *sorted(manifest.contents)])
         async with self._uploader.upload(offer) as upload:
             for sha256 in sorted(upload.wanted & manifest.contents):
-                await upload.send(await asyncio.to_thread(pieces.read, sha256))
+                await upload.send(await in_thread(pieces.read, sha256))
             if name in upload.wanted:
                 await upload.send(listed)
             await upload.finish()
@@ -389,10 +414,24 @@ def _with(saved: VolumeSaved, *, snapshot: str = "", error: str = "") -> VolumeS
     )
 
 
+def _allowance(size: int) -> Allowance:
+    """Let the present task read a volume until it is cancelled: the thread that reads ends soon then."""
+    task = asyncio.current_task()
+    assert task is not None
+    return Allowance(size, lambda: not task.cancelling())
+
+
 def _size_of(root: int) -> int:
     """Return how many bytes the file system of a folder can hold."""
     found = os.fstatvfs(root)
     return found.f_blocks * found.f_frsize
+
+
+def _discard(made: tuple[Path, int]) -> None:
+    """Close and remove a volume that was just made. Blocks."""
+    new, root = made
+    os.close(root)
+    _remove(new)
 
 
 def _remove(path: Path) -> None:

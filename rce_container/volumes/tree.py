@@ -7,7 +7,6 @@ functions but :func:`write` block.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import errno
 import fcntl
@@ -36,6 +35,7 @@ from rce.control.snapshots import (
 from rce.model import about
 from rce_container.descent import FOLDER, Descent, names_in
 from rce_container.forkserver.kernel import punch_hole, sync_file_system
+from rce_container.packages.disk import in_thread
 
 Fetch: TypeAlias = Callable[[str], Awaitable[bytes]]
 """Returns a content by its hash, in hex; raises :class:`SnapshotError`."""
@@ -70,13 +70,14 @@ class Allowance:
         """Count a file of this size.
 
         Raises:
-            SnapshotError: The files are too large together.
+            SnapshotError: The files are too large together, or not wanted any more.
         """
         self._pieces += -(-size // PIECE)
         if self._pieces > MAX_PIECES:
             raise SnapshotError(
                 f"its files are larger than {about(MAX_PIECES * PIECE)} together, with their holes"
             )
+        self._check_wanted()
 
     def take(self, count: int) -> None:
         """Count data that is about to be read.
@@ -90,6 +91,9 @@ class Allowance:
                 f"its files hold more than the {about(self._size)} that it may hold; each hard link counts "
                 "as a file, and 512 kB that hold any data count whole"
             )
+        self._check_wanted()
+
+    def _check_wanted(self) -> None:
         if not self._is_wanted():
             raise SnapshotError("its container ended while it was read")
 
@@ -449,7 +453,7 @@ async def write(manifest: Manifest, root: int, fetch: Fetch) -> None:
         for entry in reversed(manifest.entries):
             if isinstance(entry, FolderEntry):
                 _finish_at(made, entry)
-    await asyncio.to_thread(sync_file_system, root)
+    await in_thread(sync_file_system, root)
 
 
 async def _write_file(file: FileEntry, fd: int, fetch: Fetch) -> None:
@@ -458,7 +462,7 @@ async def _write_file(file: FileEntry, fd: int, fetch: Fetch) -> None:
         data = await fetch(piece.hex())
         if len(data) != length or digest(data) != piece:
             raise SnapshotError(f"a piece of {os.fsdecode(file.path)} is not what its hash says")
-        await asyncio.to_thread(_write_all, fd, data, offset)
+        await in_thread(_write_all, fd, data, offset)
     _finish(fd, file)
 
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import shutil
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -18,24 +19,26 @@ from support.control_ends import SECRET
 from rce.control.messages import (
     CONTROL_VERSION,
     SNAPSHOTS,
+    RemoveVolume,
     RestoreVolume,
     SaveVolume,
     ToMaster,
     VolumeLimit,
+    VolumeRemoved,
     VolumeRestored,
     VolumeSaved,
     Welcome,
 )
 from rce.control.model import VolumePlacement
-from rce.control.snapshots import Offer, decode_manifest
-from rce.control_channel.contents import ContentClient
+from rce.control.snapshots import Offer, decode_manifest, digest
+from rce.control_channel.contents import ContentClient, Piece
 from rce.control_channel.dialing import Dialer
 from rce.control_channel.peer import Peer
 from rce.control_channel.server import ControlServer
 from rce.control_channel.uploads import Upload, Uploader
 from rce.masters import Masters
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
-from rce_container.volumes import images, snapshots
+from rce_container.volumes import images, snapshots, tree
 from rce_container.volumes.places import VolumePlaces
 from rce_container.volumes.store import VolumeStore
 from rce_master.packages.contents import ContentStore
@@ -269,11 +272,20 @@ async def test_a_container_that_starts_gives_no_snapshot(
 
 
 class StuckUploader(Uploader):
-    """Sends no snapshot of one volume to its end."""
+    """Sends no snapshot of one volume to its end.
+
+    Attributes:
+        began: Set when it was to send one.
+    """
+
+    def __init__(self, dialer: Dialer) -> None:
+        super().__init__(dialer)
+        self.began = asyncio.Event()
 
     @asynccontextmanager
     async def upload(self, offer: Offer) -> AsyncIterator[Upload]:
         if offer.volume == JOURNAL:
+            self.began.set()
             await asyncio.Event().wait()
         async with super().upload(offer) as upload:
             yield upload
@@ -390,3 +402,123 @@ async def test_a_master_that_has_no_room_refuses(pair: tuple[Machine, Machine], 
         shutil.rmtree(kept.folder)
         kept.folder.write_text("no folder")
         assert "cannot keep the snapshot" in (await save(a)).error
+
+
+class StuckFetch:
+    """A master that gives no content.
+
+    Attributes:
+        began: Set when it was asked for one.
+    """
+
+    def __init__(self) -> None:
+        self.began = asyncio.Event()
+
+    async def __call__(self, sha256: str, offset: int) -> Piece:
+        self.began.set()
+        await asyncio.Event().wait()
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("runtime", "limit"),
+    [
+        ("process", VolumeLimit.WATCHED),
+        pytest.param("namespace", VolumeLimit.IMAGE, marks=[pytest.mark.needs("bwrap"), IMAGES]),
+    ],
+)
+async def test_a_container_called_back_starts_during_its_save(
+    folder: Path, runtime: str, limit: VolumeLimit
+) -> None:
+    """The master gave the move up; the snapshot would be for nothing, and may take hours."""
+    a = Machine(folder / "a", runtime)
+    a.volume_limit = limit
+    try:
+        async with keeping(folder, a), contextlib.AsyncExitStack() as stack:
+            assert a.uploader is not None
+            a.uploader = stuck = StuckUploader(a.uploader._dialer)
+            await stack.enter_async_context(a.engine())
+            await put(a, 1, 1, is_new=True)
+            await a.log_holds(BOX, "node", "1 runs")
+            await a.drop(BOX)
+            await a.manager.handle(SaveVolume(volume=JOURNAL, placement=1))
+            await stuck.began.wait()
+            await put(a, 200, 1)
+            await a.log_holds(BOX, "node", "2 runs")
+            assert (a.faults, a.of(VolumeSaved)) == ([], [])
+            await a.drop(BOX, 300)
+    finally:
+        a.tidy()
+
+
+async def test_a_container_called_back_ends_the_scan(
+    pair: tuple[Machine, Machine], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that reads the volume does not read it to its end."""
+    a, _ = pair
+    began, go_on, read = threading.Event(), threading.Event(), []
+
+    def digest_when_told(data: bytes) -> bytes:
+        read.append(len(data))
+        began.set()
+        go_on.wait(60)
+        return digest(data)
+
+    monkeypatch.setattr(tree, "digest", digest_when_told)
+    async with keeping(folder, a), a.engine():
+        files(a).mkdir(parents=True)
+        (files(a) / "large").write_bytes(os.urandom(4 * MEGABYTE))
+        await put(a, 1, 1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await a.drop(BOX)
+        await a.manager.handle(SaveVolume(volume=JOURNAL, placement=1))
+        await until(began.is_set, what="it is read")
+        await put(a, 200, 1)
+        go_on.set()
+        await a.log_holds(BOX, "node", "2 runs")
+        assert len(read) == 1
+        await a.drop(BOX, 300)
+
+
+async def test_a_newer_order_takes_the_place_of_an_older_one(
+    pair: tuple[Machine, Machine], folder: Path
+) -> None:
+    """The older one is of a move that was given up; its time may not be over for hours."""
+    a, _ = pair
+    async with keeping(folder, a), contextlib.AsyncExitStack() as stack:
+        assert a.uploader is not None
+        a.uploader = stuck = StuckUploader(a.uploader._dialer)
+        await stack.enter_async_context(a.engine())
+        files(a).mkdir(parents=True)
+        a.manager._volumes.places.note_placement(JOURNAL, 1)
+        await a.manager.handle(SaveVolume(volume=JOURNAL, placement=1))
+        await stuck.began.wait()
+        saved = await save(a, 2)
+        assert (saved.placement, saved.error) == (2, "its files are not on this machine")
+
+
+async def test_a_volume_being_restored_can_be_removed(pair: tuple[Machine, Machine], folder: Path) -> None:
+    _, b = pair
+    async with keeping(folder, b), contextlib.AsyncExitStack() as stack:
+        b.fetch_content = stuck = StuckFetch()
+        await stack.enter_async_context(b.engine())
+        order = RestoreVolume(volume=JOURNAL, placement=2, snapshot="0" * 64, size=SIZE)
+        await b.manager.handle(order)
+        await stuck.began.wait()
+        await b.manager.handle(RemoveVolume(volume=JOURNAL))
+        await until(lambda: b.of(VolumeRemoved), what="it is removed")
+        assert b.of(VolumeRestored) == []
+
+
+async def test_a_manager_that_ends_gives_up_a_restore(pair: tuple[Machine, Machine], folder: Path) -> None:
+    """It would be given the container as soon as it has the files."""
+    _, b = pair
+    order = RestoreVolume(volume=JOURNAL, placement=2, snapshot="0" * 64, size=SIZE)
+    async with keeping(folder, b):
+        b.fetch_content = stuck = StuckFetch()
+        async with asyncio.timeout(60), b.managed():
+            await b.manager.handle(order)
+            await stuck.began.wait()
+            b.quit.set()
+        await b.manager.handle(order)
+    assert b.of(VolumeRestored) == []
