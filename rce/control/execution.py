@@ -30,6 +30,8 @@ WINDOW = 256 << 10
 """Bytes of contents that may be on the way to the engine's programs."""
 MIN_WINDOW = 2 * MAX_DATA
 """So that a command's output and its errors have room."""
+MAX_SIDE = 0xFFFF
+"""Rows and columns that a terminal may have."""
 MAX_ARGUMENTS = 1024
 MAX_COMMAND = 128 << 10
 """Bytes of a command with all its arguments and variables."""
@@ -113,7 +115,7 @@ def decode(frame: bytes) -> Frame:
 
 def size_frame(rows: int, columns: int) -> Frame:
     """Make the frame that tells a terminal's size."""
-    return Frame(Part.SIZE, _SIZE.pack(min(rows, 65535), min(columns, 65535)))
+    return Frame(Part.SIZE, _SIZE.pack(min(rows, MAX_SIDE), min(columns, MAX_SIDE)))
 
 
 def read_size(data: bytes) -> tuple[int, int]:
@@ -173,6 +175,10 @@ def read_command(text: str | bytes) -> Command:
         )
     if command.window and command.window < MIN_WINDOW:
         raise ValueError(f"the window has {command.window} bytes; at least {MIN_WINDOW} are needed, or 0")
+    if not (0 <= command.rows <= MAX_SIDE and 0 <= command.columns <= MAX_SIDE):
+        raise ValueError(
+            f"the terminal has {command.rows} rows and {command.columns} columns; 0 to {MAX_SIDE} are allowed"
+        )
     texts = [*command.argv, *command.variables, *command.variables.values()]
     if any("\0" in one for one in texts) or any("=" in name or not name for name in command.variables):
         raise ValueError("arguments and variables hold no NUL, names of variables no '='")

@@ -100,7 +100,11 @@ class Executions:
         if command.tool:
             argv = [sys.executable, "-m", "rce.ros.tools", *argv]
         env = {**self._environ(), **command.variables, NODE_MARK: mark}
-        streams = _Terminal(command.rows, command.columns) if command.terminal else _Pipes()
+        try:
+            streams = _Terminal(command.rows, command.columns) if command.terminal else _Pipes()
+        except OSError as error:
+            what = "a terminal" if command.terminal else "its pipes"
+            return ended_frame(NOT_RUN, f"the container's machine cannot make {what}: {error.strerror}")
         with streams:
             try:
                 child = self._reaper.spawn_attached(
@@ -133,13 +137,17 @@ class _Pipes:
     """Three pipes."""
 
     def __init__(self) -> None:
-        pairs = os.pipe2(os.O_CLOEXEC), os.pipe2(os.O_CLOEXEC), os.pipe2(os.O_CLOEXEC)
+        self._open: set[int] = set()
+        try:
+            pairs = self._make(), self._make(), self._make()
+        except OSError:
+            self._close(*self._open)
+            raise
         self.of_child = (pairs[0][0], pairs[1][1], pairs[2][1])
         self.input = pairs[0][1]
         self.outputs = {Part.OUTPUT: pairs[1][0], Part.ERROR: pairs[2][0]}
         for fd in (self.input, *self.outputs.values()):
             os.set_blocking(fd, False)
-        self._open = {fd for pair in pairs for fd in pair}
 
     def __enter__(self) -> Self:
         return self
@@ -157,6 +165,11 @@ class _Pipes:
 
     def resize(self, rows: int, columns: int) -> None:
         """Pipes have no size."""
+
+    def _make(self) -> tuple[int, int]:
+        pair = os.pipe2(os.O_CLOEXEC)
+        self._open.update(pair)
+        return pair
 
     def _close(self, *fds: int) -> None:
         for fd in self._open.intersection(fds):
@@ -189,10 +202,10 @@ class _Terminal:
         """A terminal has no end; Ctrl-D is a character."""
 
     def resize(self, rows: int, columns: int) -> None:
-        """Set the size; the kernel tells the command."""
+        """Set the size, unless it is impossible; the kernel tells the command."""
         import termios
 
-        with contextlib.suppress(OSError, termios.error):
+        with contextlib.suppress(OSError, OverflowError, termios.error):
             termios.tcsetwinsize(self.input, (rows, columns))
 
     def _close(self, *fds: int) -> None:

@@ -20,6 +20,7 @@ from rce.aio.window import Window
 from rce.cli.main import Plugged
 from rce.control.execution import (
     MAX_DATA,
+    MAX_SIDE,
     NOT_RUN,
     WINDOW,
     Command,
@@ -81,7 +82,7 @@ def run_command(container: str, command: Command, *, user: str = "", stdin: bool
     """
     if command.terminal:
         size = shutil.get_terminal_size()
-        command = replace(command, rows=size.lines, columns=size.columns)
+        command = replace(command, rows=min(size.lines, MAX_SIDE), columns=min(size.columns, MAX_SIDE))
     try:
         return asyncio.run(_run(container, command, user, stdin))
     except BrokenPipeError:

@@ -67,6 +67,8 @@ def test_the_last_frame_holds_code_and_reason() -> None:
         ('{"argv": ["a\\u0000b"]}', "NUL"),
         (f'{{"window": {MIN_WINDOW - 1}}}', "window"),
         ('{"window": -1}', "window"),
+        ('{"rows": 70000}', "70000 rows"),
+        ('{"columns": -1}', "-1 columns"),
         ('{"variables": {"A=B": "c"}}', "'='"),
         ('{"variables": {"": "c"}}', "'='"),
         ('{"argv": ' + str(["x"] * (MAX_ARGUMENTS + 1)).replace("'", '"') + "}", "1025 arguments"),
