@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rce.model import EndpointId, Network, Resources
 from rce_container.environment import messages as m
-from rce_container.environment import proc
 from rce_container.exceptions import ContainerError, StartError, StateError, VolumeError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.limits import ControlGroup, Limiter, limits_of
@@ -133,7 +132,7 @@ class Launcher:
         try:
             folder.write_record(record)
         except StateError:
-            proc.kill(process)  # all processes of the container end with it
+            handle.discard()
             raise
         return Launched(handle, control_group, runtime.isolated)
 

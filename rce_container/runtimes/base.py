@@ -27,6 +27,7 @@ from rce_container.volumes.store import VolumeMount
 
 _KILL_PAUSE_S = 0.01
 _KILL_TIMEOUT_S = 10.0
+_DISCARD_TIMEOUT_S = 1.0
 
 
 class Order(NamedTuple):
@@ -149,6 +150,14 @@ class Handle:
         """Collect the exit code, so that no zombie is left."""
         if self._popen is not None and not self.alive:
             self._popen.wait()
+            self._popen = None
+
+    def discard(self) -> None:
+        """Kill the shim of a container that is not to start: all processes of the container end with it."""
+        proc.kill(self.process)
+        if self._popen is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):  # the next child's start collects it
+                self._popen.wait(_DISCARD_TIMEOUT_S)
             self._popen = None
 
     def abandon(self) -> None:

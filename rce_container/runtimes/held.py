@@ -91,6 +91,11 @@ class HeldHandle(Handle):
         finally:
             self._close()
 
+    def discard(self) -> None:
+        """Kill the shim, and close what the environment would have had."""
+        super().discard()
+        self._close()
+
     def abandon(self) -> None:
         """Leave the container running; without an environment it ends."""
         self._close()

@@ -18,6 +18,9 @@ from support.containers import Machine, until
 
 from rce.control.model import EndpointState, NodeState
 from rce.model.specs import NodeSpec, RestartPolicy
+from rce_container.environment import proc
+from rce_container.exceptions import StateError
+from rce_container.folder import ContainerFolder, Record
 from tools.leaks import footprint
 
 BOX = "user/box"
@@ -170,3 +173,26 @@ async def test_a_full_disk_is_told_and_nothing_else_is_lost(machine: Machine, sm
         await machine.drop("user/first")
         assert machine.status("user/first") is None
     assert not list(small_disk.rglob("*.new"))
+
+
+async def test_a_container_without_a_record_leaves_nothing(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its processes were started already, and it is tried again as long as the disk is full."""
+    refused: list[Record] = []
+
+    def refuse(folder: ContainerFolder, record: Record) -> None:
+        refused.append(record)
+        raise StateError(f"cannot write {folder.path}: {os.strerror(errno.ENOSPC)}")
+
+    async with machine.engine():
+        await machine.put("user/first", nodes=(ECHO,))
+        await machine.node_is("user/first", "echo", NodeState.RUNNING)
+        await machine.drop("user/first")
+        before = footprint(os.getpid()).fds
+        monkeypatch.setattr(ContainerFolder, "write_record", refuse)
+        await machine.put(BOX, nodes=(ECHO,))
+        await until(lambda: len(refused) >= 3, what="three attempts")
+        await machine.drop(BOX)
+        assert footprint(os.getpid()).fds == before
+        assert [one.pid for one in refused if proc.read(one.pid, zombies=True)] == []
