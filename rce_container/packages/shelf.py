@@ -6,7 +6,6 @@ from collections.abc import Collection
 from pathlib import Path
 
 from rce_container.environment.user_packages import REQUIREMENTS
-from rce_container.files import remove
 from rce_container.packages.disk import replicate, scratch
 
 KEPT = 8
@@ -15,7 +14,7 @@ _STAGING = "bundles.new"
 
 
 class Shelf:
-    """One container's packages. Each appears complete, by one rename.
+    """One container's packages. Each appears complete and vanishes as a whole, by one rename.
 
     Args:
         folder: The folder that the container sees; exists as long as the container.
@@ -62,4 +61,5 @@ class Shelf:
         left = [path for path in self._folder.iterdir() if path.name not in wanted]
         left.sort(key=lambda path: path.stat().st_mtime)
         for path in left[:-KEPT]:
-            remove(path)
+            with scratch(self._folder.parent / _STAGING) as folder:
+                path.rename(folder / path.name)

@@ -80,6 +80,8 @@ class Supply:
         self._on_arrival = on_arrival
         self._tasks = BackgroundTasks()
         self._coming: dict[PackageSpec, asyncio.Task[None]] = {}
+        self._shelf_lock = asyncio.Lock()
+        """Held while the shelf is looked at or changed: a package being removed must not count as there."""
         self._closed = False
 
     def want(self, packages: Iterable[PackageSpec]) -> None:
@@ -127,13 +129,15 @@ class Supply:
         return text
 
     async def _bring(self, package: PackageSpec) -> None:
-        if self._shelf.has(package.sha256):
-            return
+        async with self._shelf_lock:
+            if self._shelf.has(package.sha256):
+                return
         try:
             tree = await self._library.cache.ensure(self._user, package)
             requirements = await self._install(package, tree)
-            await in_thread(self._shelf.place, package.sha256, tree, requirements)
-            await in_thread(self._shelf.tidy, {one.sha256 for one in self._coming})
+            async with self._shelf_lock:
+                await in_thread(self._shelf.place, package.sha256, tree, requirements)
+                await in_thread(self._shelf.tidy, {one.sha256 for one in self._coming})
         except OSError as error:
             if self._shelf.is_there:
                 raise trouble_of(error) from error

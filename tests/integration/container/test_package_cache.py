@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import threading
+from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,6 +20,7 @@ from rce.control_channel.contents import Piece
 from rce.packages import unpacking
 from rce.packages.limits import ArchiveLimits
 from rce.packages.unpacking import unpack
+from rce_container.files import remove
 from rce_container.packages import disk, shelf
 from rce_container.packages.cache import PackageCache
 from rce_container.packages.disk import replicate
@@ -235,6 +238,62 @@ def test_a_shelf_keeps_the_newest_of_what_nobody_names(tmp_path: Path) -> None:
         os.utime(folder / str(number), (number, number))
     made.tidy({"0"})
     assert {path.name for path in folder.iterdir()} == {"0", *(str(n) for n in range(3, shelf.KEPT + 3))}
+
+
+def test_a_package_is_off_the_shelf_before_its_removal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node that starts meanwhile would find a part of it."""
+    (tmp_path / "tree").mkdir()
+    folder = tmp_path / "box" / "bundles"
+    folder.mkdir(parents=True)
+    made = Shelf(folder, link=True)
+    for number in range(shelf.KEPT + 1):
+        made.place(str(number), tmp_path / "tree", None)
+        os.utime(folder / str(number), (number, number))
+    is_there: list[bool] = []
+
+    def look(path: Path) -> None:
+        is_there.append(made.has("0"))
+        remove(path)
+
+    for module in (disk, shelf):
+        monkeypatch.setattr(module, "remove", look, raising=False)
+    made.tidy(())
+    assert is_there == [False]
+    assert list((tmp_path / "box" / "bundles.new").iterdir()) == []
+
+
+async def test_a_package_wanted_again_during_tidying_stays(
+    depot: Depot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began, go_on, tidy = threading.Event(), threading.Event(), Shelf.tidy
+
+    def tidy_when_told(shelf: Shelf, wanted: Collection[str]) -> None:
+        began.set()
+        go_on.wait(60)
+        tidy(shelf, wanted)
+
+    cache = opened(depot, tmp_path / "cache")
+    old, new = depot.make("nav", "1.0"), depot.make("nav", "1.1")
+    (tmp_path / "box").mkdir()
+    box = Shelf(tmp_path / "box", link=True)
+    box.place(old.sha256, await cache.ensure("user", old), None)
+    os.utime(tmp_path / "box" / old.sha256, (0, 0))
+    for number in range(shelf.KEPT):  # so that the old one is too many
+        (tmp_path / "box" / str(number)).mkdir()
+    monkeypatch.setattr(Shelf, "tidy", tidy_when_told)
+    arrived = asyncio.Event()
+    supply = Supply("box", "user", Library(cache=cache), box, tell=lambda _: None, on_arrival=arrived.set)
+    supply.want([new])
+    await asyncio.to_thread(began.wait, 60)
+    supply.want([old])
+    for _ in range(10):
+        await asyncio.sleep(0)  # it would be found on the shelf
+    go_on.set()
+    await asyncio.wait_for(arrived.wait(), 60)
+    await supply.close()
+    assert box.has(old.sha256)
 
 
 def test_a_container_that_is_gone_gets_nothing(tmp_path: Path) -> None:
