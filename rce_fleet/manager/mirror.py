@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -66,13 +66,17 @@ class Mirror(Generic[K, V]):
         self._wait_until.pop(key, None)
         self._accepted.pop(key, None)
 
-    def compare(self, kept: Mapping[K, V], seen: Mapping[K, V], now: float) -> Differences[K, V]:
+    def compare(
+        self, kept: Mapping[K, V], seen: Mapping[K, V], now: float, untold: Collection[K] = ()
+    ) -> Differences[K, V]:
         """Return what has to be sent to the planner, and what was changed there.
 
         Args:
             kept: The journal's values.
             seen: The planner's.
             now: Seconds.
+            untold: Keys that have to be sent though the values may be equal: their parts that are not
+                compared were changed.
         """
         found: Differences[K, V] = Differences()
         self._accepted = {key: value for key, value in self._accepted.items() if now < value[1]}
@@ -80,12 +84,12 @@ class Mirror(Generic[K, V]):
             here, there, agreed = kept.get(key), seen.get(key), self._agreed.get(key)
             if key in self._accepted:
                 there = self._accepted[key][0]
-            if here == there:
+            if here == there and key not in untold:
                 self._agree(key, here)
                 self._wait_until.pop(key, None)
             elif now < self._wait_until.get(key, now):
                 continue
-            elif here == agreed:
+            elif here == agreed and key not in untold:
                 found.to_adopt[key] = there
             else:
                 found.to_send[key] = here

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING, TypeAlias
 
-from rce_fleet.manager.mirror import Mirror
+from rce_fleet.limits import MOST_LIFETIME
+from rce_fleet.manager.mirror import SETTLE_S, Mirror
 from rce_fleet.manager.zones import rule
 from rce_fleet.tasks.other_floor import leave_floor
 from rce_fleet.tasks.records import AUTOMATIC, BlockedCells, FleetEntry, PlannerRun, RobotEntry, Zone
@@ -23,8 +24,14 @@ if TYPE_CHECKING:
 CELLS_DELAY_S = 6.0
 """Longest time after which the planner's list of blocked cells has an accepted one: a list counts only when
 the planner was heard again after it."""
+ENDS_NEAR_S = 10.0
+"""Ends of a zone in journal and planner differ by so much at most: by how long messages take, and because a
+program that prolongs its zone often shall not fill the journal."""
 FLEET = ""
 """Stands for the whole fleet where modes are by robot."""
+_LATE_S = 1.0
+"""So much later than in the journal a zone may end at the planner because it was told later."""
+_NOT_TOLD = 0, -inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +77,8 @@ class PlannerSync:
         self._modes: Mirror[str, str] = Mirror()
         self._zones: Mirror[str, Zone] = Mirror()
         self._cells: Mirror[int, bool] = Mirror(CELLS_DELAY_S)
+        self._told: dict[str, tuple[int, float]] = {}
+        """Which revision of a zone the planner accepted last, and when."""
         self._run = PlannerRun()
         self._unlisted: dict[int, float] = {}
         """Until when the planner's list need not have cells that are blocked since a robot has left them."""
@@ -93,8 +102,10 @@ class PlannerSync:
         is_other_floor = run.has_other_floor(known)
         self._modes.restart({**self._modes_kept(), **self._unsent_modes()} if is_same else {})
         keeps = is_same or is_other_floor
-        unsent = self._unsent_zones() if not is_other_floor else {}
+        unsent = self._unsent_removals() if not is_other_floor else {}
         self._zones.restart({**self._zones_kept(), **unsent} if keeps else {})
+        # Another grid has none of the zones: what was not sent is not wanted there.
+        self._told = {zone.id: (zone.revision, now) for zone in book.zones.values()} if is_other_floor else {}
         told = dict.fromkeys(book.blocked.cells, True)
         # False: a stand-in that no cell equals, for those that the planner may not have, or still has.
         waiting = dict.fromkeys(() if is_other_floor else book.blocked.unsent, False)
@@ -118,18 +129,26 @@ class PlannerSync:
             now: Seconds since 1970.
         """
         book, facts = self._book, self._facts
+        is_comparable = self._is_comparable()
+        if is_comparable:
+            self._adopt_ends(now)
         for zone in list(book.zones.values()):
             if zone.until is not None and zone.until <= now:
-                gone = replace(zone, is_removed=True, revision=zone.revision + 1, unsent=True)
+                is_sent = is_comparable or zone.unsent
+                gone = replace(zone, is_removed=True, revision=zone.revision + 1, unsent=is_sent)
                 book.emit(gone, "zone ended", now, text=f"zone {zone.id} has ended")
-        if not self._is_comparable():
+                if not is_sent:
+                    self._zones.forget(zone.id)  # it may have been prolonged at a planner that is silent now
+        if not is_comparable:
             return
         self._note_run(now)  # again, if the journal could not be written
         self._note_pending(now)
         for name, mode in self._modes.compare(*self._modes_of_both(), now).to_adopt.items():
             self._adopt_mode(name, mode or AUTOMATIC, now)
-        for key, zone_seen in self._zones.compare(*self._zones_of_both(), now).to_adopt.items():
-            self._adopt_zone(key, zone_seen, now)
+        zones = self._zones.compare(*self._zones_of_both(), now, self._untold())
+        for key, zone_seen in zones.to_adopt.items():
+            if zone_seen is None or key in book.zones or _end(facts.zones[key], now) > now + _LATE_S:
+                self._adopt_zone(key, zone_seen, now)
         if facts.requested is not None:
             self._adopt_cells(self._cells.compare(*self._cells_of_both(), now).to_adopt, now)
 
@@ -145,7 +164,7 @@ class PlannerSync:
         for name, mode in self._modes.compare(*self._modes_of_both(), now).to_send.items():
             entry = book.fleet if name == FLEET else book.entry(name)
             out.append(SetMode(name, mode or AUTOMATIC, entry.reason, entry.user))
-        for key in self._zones.compare(*self._zones_of_both(), now).to_send:
+        for key in self._zones.compare(*self._zones_of_both(), now, self._untold()).to_send:
             out.append(SetZone(key, book.zones.get(key)))
         if self._facts.requested is not None:
             cells = self._cells.compare(*self._cells_of_both(), now).to_send
@@ -164,6 +183,8 @@ class PlannerSync:
             self._modes.sent(call.robot, None if call.mode == AUTOMATIC else call.mode, now, refused=refused)
         elif isinstance(call, SetZone):
             self._zones.sent(call.id, None if call.zone is None else rule(call.zone), now, refused=refused)
+            if call.zone is not None and not refused:
+                self._told[call.id] = call.zone.revision, now
         else:
             self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
 
@@ -180,6 +201,9 @@ class PlannerSync:
         if known is None or not known.unsent or known.revision != zone.revision:
             return False
         back = replace(known, is_removed=True, unsent=False) if before is None else before
+        revision, told_at = self._told.get(zone.id, _NOT_TOLD)
+        if revision == back.revision:
+            self._told[zone.id] = known.revision + 1, told_at
         text = f"zone {zone.id} is as it was before: {refusal}"
         self._book.emit(replace(back, revision=known.revision + 1), "refused", now, text=text)
         return True
@@ -190,7 +214,8 @@ class PlannerSync:
             return []
         book, modes, zones = self._book, self._modes_kept(), self._zones_kept()
         entries = [entry for entry in book.robots.values() if entry.unsent]
-        changed = [zone for zone in (*book.zones.values(), *book.removed_zones.values()) if zone.unsent]
+        untold, candidates = self._untold(), (*book.zones.values(), *book.removed_zones.values())
+        changed = [zone for zone in candidates if zone.unsent and zone.id not in untold]
         fleet = [book.fleet] if book.fleet.unsent and self._modes.is_known(FLEET, modes.get(FLEET)) else []
         return [
             *self._confirmed_cells(),
@@ -266,10 +291,15 @@ class PlannerSync:
         robots = {name: "" for name, entry in book.robots.items() if entry.unsent}
         return {**robots, FLEET: ""} if book.fleet.unsent else robots
 
-    def _unsent_zones(self) -> dict[str, Zone]:
-        """Return stand-ins that no zone equals, for zones that the planner may not have, or still has."""
-        zones = {**self._book.zones, **self._book.removed_zones}
-        return {name: Zone(name, "", ()) for name, zone in zones.items() if zone.unsent}
+    def _unsent_removals(self) -> dict[str, Zone]:
+        """Return stand-ins that no zone equals, for removed zones that the planner may still have."""
+        return {name: Zone(name, "", ()) for name in self._book.removed_zones}
+
+    def _untold(self) -> set[str]:
+        """Return zones that the planner was not told since a request changed them, maybe only their end."""
+        told = self._told
+        unsent = (zone for zone in self._book.zones.values() if zone.unsent)
+        return {zone.id for zone in unsent if told.get(zone.id, _NOT_TOLD)[0] != zone.revision}
 
     def _zones_kept(self) -> dict[str, Zone]:
         return {zone.id: rule(zone) for zone in self._book.zones.values()}
@@ -306,11 +336,28 @@ class PlannerSync:
         made = replace(self._facts.zones[key], revision=book.next_revision(known))
         book.emit(made, "zone", now, user=made.user, text=f"zone {key}: {made.kind}")
 
+    def _adopt_ends(self, now: float) -> None:
+        """Take over ends of zones that were changed at the planner, where they are still to come."""
+        for key, seen in self._facts.zones.items():
+            known, (_, told_at) = self._book.zones.get(key), self._told.get(key, _NOT_TOLD)
+            if known is None or known.unsent or now < told_at + SETTLE_S:
+                continue
+            here, there = _end(known, now), _end(seen, now)
+            is_other = here != there and (here <= now or abs(there - here) > ENDS_NEAR_S)
+            if is_other and there > now + _LATE_S and rule(known) == rule(seen):
+                self._adopt_zone(key, seen, now)
+
     def _adopt_cells(self, changes: dict[int, bool | None], now: float) -> None:
         if not changes:
             return
         made = self._book.blocked.changed({cell: bool(one) for cell, one in changes.items()}, unsent=False)
         self._book.emit(made, "blocked", now, text=f"{len(made.cells)} cells are blocked")
+
+
+def _end(zone: Zone, now: float) -> float:
+    """Return when a zone ends; infinity also if it is so late that the planner cannot be told the time."""
+    until = inf if zone.until is None else zone.until
+    return until if until < now + MOST_LIFETIME / 2 else inf
 
 
 def _words(mode: str) -> str:

@@ -7,14 +7,13 @@ from math import inf, pi
 from types import SimpleNamespace
 
 import pytest
+from support.planner_copy import RUN, SPILL, Both
 
 from rce_fleet.limits import MOST_LIFETIME
 from rce_fleet.manager.convert import show_profile
 from rce_fleet.manager.planner_sync import (
     CELLS_DELAY_S,
     BlockCell,
-    PlannerCall,
-    PlannerSync,
     SetMode,
     SetZone,
 )
@@ -37,51 +36,6 @@ from rce_fleet.tasks.records import (
 from rce_fleet.tasks.task import TaskState
 from rce_fleet.tasks.travel import TravelCosts
 from rce_fleet.tasks.zone_costs import zone_profiles
-
-RUN = PlannerRun("1.0", "8 x 8")
-SPILL = Zone("spill", "blocked", (5, 6), reason="oil", user="anna")
-
-
-class Both:
-    """A book, a planner that does what it is told, and a clock."""
-
-    def __init__(self, book: TaskBook | None = None, run: PlannerRun = RUN) -> None:
-        self.book = book or TaskBook()
-        self.facts = FleetFacts(is_live=True, is_current=True, requested=frozenset())
-        self.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
-        self.sync = PlannerSync(self.book, self.facts)
-        self.now = 1000.0
-        self.sync.begin(run, self.now)
-        self.facts.requested = frozenset()
-
-    def step(self, seconds: float = 3.0, *, refused: bool = False) -> list[PlannerCall]:
-        """Let time pass; the planner carries out what it is told, unless it refuses."""
-        self.now += seconds
-        self.sync.adopt(self.now)
-        calls = self.sync.calls(self.now)
-        for call in calls:
-            self.sync.took(call, self.now, refused=refused)
-            if not refused:
-                self._carry_out(call)
-        return calls
-
-    def _carry_out(self, call: PlannerCall) -> None:
-        facts = self.facts
-        if isinstance(call, SetMode):
-            if call.robot:
-                facts.robots[call.robot].mode = call.mode
-            else:
-                facts.mode = call.mode
-        elif isinstance(call, BlockCell):
-            assert facts.requested is not None
-            facts.requested = facts.requested | {call.cell} if call.blocked else facts.requested - {call.cell}
-        elif call.zone is None:
-            del facts.zones[call.id]
-        else:
-            facts.zones[call.id] = read_zone(zone_fields(call.zone, self.now), self.now)
-
-    def mode(self, name: str = "Robot1") -> str:
-        return self.book.entry(name).mode
 
 
 def test_what_the_api_changed_goes_to_the_planner() -> None:
@@ -236,14 +190,6 @@ def test_a_robot_that_joins_again_keeps_its_mode() -> None:
     robot.mode = "automatic"
     both.facts.robots["Robot1"] = robot
     assert [call.mode for call in both.step() if isinstance(call, SetMode)] == ["paused"]
-
-
-def test_zones_expire_in_journal_and_planner() -> None:
-    both = Both()
-    both.book.emit(replace(SPILL, until=both.now + 10), "zone", both.now)
-    assert len(both.step()) == 1
-    assert both.step(20.0) == [SetZone("spill", None)]
-    assert both.book.zones == {}
 
 
 def test_a_refused_zone_is_sent_again_later() -> None:
