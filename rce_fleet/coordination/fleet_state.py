@@ -233,10 +233,12 @@ class FleetState:
 
     def _describe(self, record: RobotRecord) -> RobotSnapshot:
         route = self.ledger.route(record.id)
+        state = self._state_of(record, route)
+        waits_for_room = state is RobotState.WAITING and record.full_zone
         return RobotSnapshot(
             id=record.id,
-            state=self._state_of(record, route),
-            reason=record.reason,
+            state=state,
+            reason=record.reason or (f"zone {record.full_zone!r} is full" if waits_for_room else ""),
             x=record.x,
             y=record.y,
             yaw=record.yaw,
@@ -268,7 +270,7 @@ class FleetState:
         if len(route) > 1:
             return RobotState.WAITING
         if record.unreachable:
-            return RobotState.UNREACHABLE
+            return RobotState.WAITING if record.full_zone else RobotState.UNREACHABLE
         return _AT_REST[record.goal is not None, route == [record.goal]]
 
 

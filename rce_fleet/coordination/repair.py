@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.full_zones import note_unreachable
 from rce_fleet.coordination.path_search import FAR, Roads, Turns, costs_to, find_path, is_enclosed, moves_to
 from rce_fleet.coordination.rerouting import heading_at_start
 from rce_fleet.coordination.robot import Phase
@@ -24,7 +25,7 @@ class PathRepair:
     """Finds new paths for single robots and enters them into the ledger.
 
     Args:
-        state: The fleet; its ledger and the robots' ``unreachable`` are changed.
+        state: The fleet; its ledger and the robots' ``unreachable`` and ``full_zone`` are changed.
         settings: What turns and stops cost.
     """
 
@@ -80,9 +81,8 @@ class PathRepair:
         return self._find(record, None, self._roads(robot, forbidden), None, effort)
 
     def _note_unreachable(self, record: RobotRecord, *, is_unreachable: bool) -> None:
-        if record.unreachable != is_unreachable:
-            record.unreachable = is_unreachable
-            self._state.touch(record)
+        barred = self._state.forbidden(record.id) if is_unreachable else ()
+        note_unreachable(self._state, record, is_unreachable=is_unreachable, barred=barred)
 
     def _find(
         self, record: RobotRecord, goal: int | None, roads: Roads, field: Sequence[int] | None, effort: int

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.coordination.full_zones import note_unreachable
 from rce_fleet.coordination.improving import compute_improvement
 from rce_fleet.coordination.rerouting import (
     MOST_TURNING,
@@ -358,7 +359,7 @@ class PlanAdoption:
         was_cut: Whether a route ended before a cell that is blocked, or that a zone does not allow any more.
 
     Args:
-        state: The fleet; its ledger and the robots' ``unreachable`` are changed.
+        state: The fleet; its ledger and the robots' ``unreachable`` and ``full_zone`` are changed.
         request: The plan's request.
         result: The plan.
         zones: Revision of the zones that the plan keeps to.
@@ -372,7 +373,7 @@ class PlanAdoption:
         self._next = 0
         self._present: list[str | None] = []
         self.was_cut = False
-        unreachable = frozenset(result.unreachable)
+        unreachable, forbidden = frozenset(result.unreachable), dict(request.forbidden)
         starts = {}
         for index, robot in enumerate(request.robots):
             is_present = self._wants(index) and state.ledger.end_of_grant(robot) == request.starts[index]
@@ -380,10 +381,9 @@ class PlanAdoption:
             if not is_present:
                 continue
             starts[robot] = request.starts[index]
-            record = state.robots[robot]
-            if record.unreachable != (index in unreachable):
-                record.unreachable = index in unreachable
-                state.touch(record)
+            barred = forbidden.get(index, ())
+            record, is_unreachable = state.robots[robot], index in unreachable
+            note_unreachable(state, record, is_unreachable=is_unreachable, barred=barred)
         state.ledger.begin_plan(starts, ordered=result.ordered)
         self._versions = [state.ledger.version(robot) for robot in request.robots]
 

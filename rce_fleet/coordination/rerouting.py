@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.coordination.full_zones import note_unreachable
 from rce_fleet.coordination.ledger_view import CELLS, STEPS
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.zone_rules import ZoneRules
@@ -238,7 +239,7 @@ def adopt_rerouting(
     ends before a cell that the robot may not enter any more.
 
     Args:
-        state: The fleet; its ledger and the robots' ``unreachable`` and ``rest`` are changed.
+        state: The fleet; its ledger and the robots' ``unreachable``, ``full_zone`` and ``rest`` are changed.
         request: The request; no cells were granted since then.
         rerouting: The paths.
         versions: The ledger's versions of the robots at the time of the request.
@@ -260,7 +261,7 @@ def adopt_rerouting(
             left.add(robot)
         # All of them first: where one has its old path, another may have its new one.
         state.ledger.truncate(robot)
-    rules, shut = ZoneRules(state), state.shut
+    rules, shut, forbidden = ZoneRules(state), state.shut, dict(request.forbidden)
     for index, record, path in present:
         possible = list(_possible(record.id, request.starts[index], path, shut, rules))
         if len(possible) < len(path):
@@ -269,9 +270,8 @@ def adopt_rerouting(
         is_unreachable = index in rerouting.unreachable
         has_goal = record.goal is not None and not is_unreachable
         record.rest = None if has_goal else state.ledger.route(record.id)[-1]
-        if record.unreachable != is_unreachable:
-            record.unreachable = is_unreachable
-            state.touch(record)
+        barred = forbidden.get(index, ())
+        note_unreachable(state, record, is_unreachable=is_unreachable, barred=barred)
     return left
 
 

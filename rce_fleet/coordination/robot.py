@@ -96,6 +96,7 @@ class RobotRecord:
         goal_at: When it was sent there.
         rest: The cell it returns to when it has no goal.
         unreachable: Whether no path leads to its goal.
+        full_zone: The limited zone in which it waits for room, if only that is why; empty: none.
         centred: Whether it has been at the centre of its cell since it was placed there.
         leaving: Whether it drives out of a cell in which another robot waits; it is granted no more until it
             is at the centre of the next.
@@ -128,6 +129,7 @@ class RobotRecord:
     goal_at: float = inf
     rest: int | None = None
     unreachable: bool = False
+    full_zone: str = ""
     centred: bool = False
     leaving: bool = False
     replans: int = 0

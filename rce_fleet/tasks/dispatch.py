@@ -16,7 +16,7 @@ from rce_fleet.tasks.energy import BatteryLevels, driven, effort_of
 from rce_fleet.tasks.explaining import why_none, why_none_drives
 from rce_fleet.tasks.idle_ways import IdleWays
 from rce_fleet.tasks.matching_loops import match_rows
-from rce_fleet.tasks.parking import Parking, ParkingCells
+from rce_fleet.tasks.parking import Parking, ParkingCells, full_zones
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
 from rce_fleet.tasks.robot_queues import RobotQueues
@@ -357,6 +357,7 @@ class Dispatcher:
         self._conditions.refresh()
         self.chargers.update(idle, book.places.chargers, taken)
         used = {*book.places.chargers}.union(book.used_cells())
+        used |= full_zones(book.zones.values(), facts, used)
         cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
         self._parking.update(now, idle, self.chargers.charging, facts, cells)
 

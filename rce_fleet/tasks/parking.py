@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterable, Mapping
     from collections.abc import Set as AbstractSet
 
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
     from rce_fleet.tasks.idle_ways import IdleWays
+    from rce_fleet.tasks.records import Zone
 
 _RING = ((-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1))
 _LOOK_AT_MOST = 2000
@@ -29,7 +30,7 @@ class ParkingCells:
 
     Attributes:
         parking: The parking places; empty: there are none.
-        used: Cells of open tasks, and chargers.
+        used: Cells of open tasks, chargers, and full zones with either.
         taken: Cells to which robots go now for tasks, or where they act.
     """
 
@@ -118,6 +119,24 @@ class Parking:
             avoided.add(place)
             if place in free:
                 free.remove(place)
+
+
+def full_zones(zones: Iterable[Zone], facts: FleetFacts, used: AbstractSet[int]) -> set[int]:
+    """Return the cells of limited zones without room in which robots are needed: an idle one bars others.
+
+    Args:
+        zones: All zones.
+        facts: The robots.
+        used: Cells to which robots may have to go.
+    """
+    found: set[int] = set()
+    for zone in zones:
+        if zone.kind == "limited" and zone.value is not None and not used.isdisjoint(zone.cells):
+            cells = frozenset(zone.cells)
+            inside = [robot for robot in facts.robots.values() if robot.cell in cells]
+            if sum(zone.applies_to(robot.id) for robot in inside) >= zone.value:
+                found |= cells
+    return found
 
 
 def keeps_clear(grid: GridMap, shut: Collection[int], cell: int) -> bool:

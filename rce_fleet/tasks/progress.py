@@ -332,7 +332,8 @@ class TaskProgress:
         elif robot.state == "unreachable" and waited > self._rules.unreachable_after:
             self._give_up(task, now, f"no path leads {robot.id} to cell {task.target}")
         elif waited > self._rules.stuck_after:
-            self._give_up(task, now, f"{robot.id} has not left cell {robot.cell} for {waited:.0f} s")
+            why = f": {robot.reason}" if robot.reason else ""
+            self._give_up(task, now, f"{robot.id} has not left cell {robot.cell} for {waited:.0f} s{why}")
 
     def _miss(self, task: Task, robot: RobotFacts | None, now: float, facts: FleetFacts) -> None:
         """Decide about a task whose robot does not answer."""

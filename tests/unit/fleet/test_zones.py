@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, SendCells, Tick, ZonesSet
+from rce_fleet.coordination.events import (
+    CellBlocked,
+    CellFreed,
+    GoalSet,
+    ModeSet,
+    SendCells,
+    Tick,
+    ZonesSet,
+)
+from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import PlanRequest, compute_plan
 from rce_fleet.coordination.settings import FleetSettings
@@ -343,6 +352,64 @@ def test_closing_all_ways_of_a_robot_stops_it(
     assert 7 not in robot(fleet).plan
     assert fleet.ask(ZonesSet((), remove=("shut",))).ok
     fleet.run(fleet.all_arrived)
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_a_robot_waits_for_room_in_a_full_zone(
+    make_fleet: type[SimulatedClients], settings: FleetSettings
+) -> None:
+    """It is unreachable while a blocked zone is in its way as well."""
+    fleet = make_fleet(FleetPlanner(LOOP, settings), [7, 1], 1, loss=0.0)
+    fleet.send([])
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    put(fleet, Zone("lift", ZoneKind.LIMITED, (6, 7, 8, 17, 26, 25, 24), capacity=1))
+    assert fleet.ask(GoalSet("Robot2", 25)).ok
+    fleet.run(lambda: fleet.states()[1] is RobotState.WAITING and robot(fleet, 2).reason != "")
+    assert robot(fleet, 2).reason == "zone 'lift' is full"
+    put(fleet, blocked("spill", 5, 23))
+    fleet.run(lambda: fleet.states()[1] is RobotState.UNREACHABLE)
+    assert robot(fleet, 2).reason == ""
+    assert fleet.ask(ZonesSet((), remove=("spill",))).ok
+    fleet.run(lambda: robot(fleet, 2).reason == "zone 'lift' is full")
+    assert fleet.ask(GoalSet("Robot1", 4)).ok
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet, 2).reason == ""
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_a_paused_robot_on_the_only_way_is_no_full_zone(
+    make_fleet: type[SimulatedClients], settings: FleetSettings
+) -> None:
+    """When it is resumed, the other one waits for room only."""
+    fleet = make_fleet(FleetPlanner(LOOP, settings), [7, 1], 1, loss=0.0)
+    fleet.send([])
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    put(fleet, Zone("lift", ZoneKind.LIMITED, (6, 7, 8), capacity=1), blocked("spill", 23))
+    assert fleet.ask(ModeSet("Robot1", RobotMode.PAUSED)).ok
+    fleet.run(lambda: fleet.states()[0] is RobotState.PAUSED)
+    assert fleet.ask(GoalSet("Robot2", 8)).ok
+    fleet.run(lambda: fleet.states()[1] is RobotState.UNREACHABLE)
+    assert fleet.ask(ModeSet("Robot1", RobotMode.AUTOMATIC)).ok
+    fleet.run(lambda: robot(fleet, 2).reason == "zone 'lift' is full")
+    assert fleet.states()[1] is RobotState.WAITING
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_a_full_zone_beside_the_way_is_no_reason(
+    make_fleet: type[SimulatedClients], settings: FleetSettings
+) -> None:
+    """Robot2's goal is shut off by a zone for it; Robot1 fills a zone elsewhere."""
+    fleet = make_fleet(FleetPlanner(LOOP, settings), [18, 1], 1, loss=0.0)
+    fleet.send([])
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    put(
+        fleet,
+        Zone("lift", ZoneKind.LIMITED, (18, 9), capacity=1),
+        blocked("steps", edges=((4, 5), (22, 23)), robots=("Robot2",)),
+    )
+    assert fleet.ask(GoalSet("Robot2", 8)).ok
+    fleet.run(lambda: fleet.states()[1] is RobotState.UNREACHABLE)
+    assert robot(fleet, 2).reason == ""
 
 
 def test_a_plan_ends_before_a_move_that_is_closed_for_its_robot() -> None:

@@ -62,6 +62,22 @@ def test_extreme_deadlines_leave_costs_finite(floor: Floor, deadline: float) -> 
     assert floor.task(other).state is TaskState.DONE
 
 
+def test_a_robot_that_waits_for_room_keeps_its_task(floor: Floor) -> None:
+    """The planner says that a zone is full; the task is given to others when that has lasted 120 s."""
+    robot = floor.add("Robot1", 0)
+    task = floor.go(3)
+    floor.run(1)
+    floor.stuck.add("Robot1")
+    for _ in range(100):
+        robot.state, robot.reason = "waiting", "zone 'lift' is full"
+        floor.run(1)
+    assert floor.task(task).robot == "Robot1"
+    floor.run(30)
+    assert floor.task(task).robot == ""
+    texts = [event.text for event in floor.events]
+    assert any(text.endswith("s: zone 'lift' is full") for text in texts), texts
+
+
 def test_many_tasks_are_done_once_each(floor: Floor) -> None:
     for number, cell in enumerate((0, 7, 56, 63), 1):
         floor.add(f"Robot{number}", cell)

@@ -11,7 +11,7 @@ from rce_fleet.tasks import parking as parking_module
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.parking import keeps_clear, place_to_wait
-from rce_fleet.tasks.records import Places
+from rce_fleet.tasks.records import Places, Zone
 
 from .conftest import Floor
 
@@ -29,6 +29,23 @@ def test_an_idle_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
     floor.go(20, earliest_start=floor.now + 1e6)
     floor.run(20)
     assert robot.cell != 20
+
+
+@pytest.mark.parametrize(
+    ("capacity", "robots", "moves"), [(1, (), True), (1, ("Robot2",), False), (2, (), False)]
+)
+def test_an_idle_robot_leaves_a_full_zone_of_tasks(
+    floor: Floor, capacity: int, robots: tuple[str, ...], moves: bool
+) -> None:
+    """It stays while the zone has room, is for other robots, or has no cell of a task."""
+    lift = (18, 19, 20, 26, 27, 28)
+    floor.book.emit(Zone("lift", "limited", lift, float(capacity), robots=robots), "zone", floor.now)
+    robot = floor.add("Robot1", 19)
+    floor.run(20)
+    assert robot.cell == 19
+    floor.go(28, earliest_start=floor.now + 1e6)
+    floor.run(20)
+    assert (robot.cell not in lift) is moves
 
 
 def test_robots_without_a_place_to_wait_hold_no_step_up(monkeypatch: pytest.MonkeyPatch) -> None:
