@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rce_fleet.coordination.events import (
     CellBlocked,
     GoalSet,
+    ModeSet,
     ObstacleGone,
     ObstacleSeen,
     RobotRemoved,
@@ -20,6 +21,7 @@ from rce_fleet.coordination.events import (
     Tick,
 )
 from rce_fleet.coordination.grid_change import carried_cells, next_planner, refuse_grid
+from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.move_client import ClientReport, MoveClient
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.snapshot import RobotState
@@ -98,6 +100,19 @@ def test_robots_are_awaited_on_the_new_grid_too(make_fleet: type[SimulatedClient
     fleet.run(lambda: refuse_grid(fleet.planner, FINER) == "", limit=3.0)
     planner, _ = next_planner(fleet.planner, FINER, fleet.now)
     assert planner.expected == ["Robot2"]
+
+
+def test_a_fleet_stays_paused_for_its_reason(make_fleet: type[SimulatedClients]) -> None:
+    fleet = make(make_fleet, [0])
+    assert fleet.ask(ModeSet(None, RobotMode.PAUSED, "visitors", "anna")).ok
+    fleet.run(lambda: fleet.states() == [RobotState.PAUSED])
+    before = fleet.planner.state
+    change(fleet, FINER)
+    after = fleet.planner.state
+    assert (after.mode, after.mode_reason) == (RobotMode.PAUSED, before.mode_reason)
+    assert "visitors" in after.reason_of(after.robots["Robot1"])
+    fleet.run(lambda: fleet.states() == [RobotState.PAUSED])
+    assert "visitors" in fleet.planner.snapshot().robots[0].reason
 
 
 @pytest.mark.parametrize(
