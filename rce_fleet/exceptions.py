@@ -22,6 +22,7 @@
     |   +-- RevisionError              the task was changed meanwhile
     |   +-- KeyReusedError             the requester's key belongs to another task
     +-- JournalError        the journal of the fleet manager cannot be read or written
+    |   +-- JournalInUseError          another fleet manager has it open
     +-- StationError        a request to the operator station was not carried out
     |   +-- StationUnavailableError    station or planner cannot be reached; try again later
     |   +-- RequestRefusedError        the station refused the request
@@ -151,6 +152,10 @@ class KeyReusedError(TaskError):
 
 class JournalError(FleetError):
     """The journal of the fleet manager cannot be read or written."""
+
+
+class JournalInUseError(JournalError):
+    """Another fleet manager has the journal open."""
 
 
 class StationError(FleetError):

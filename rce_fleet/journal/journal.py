@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from rce_fleet.exceptions import JournalError
+from rce_fleet.exceptions import JournalError, JournalInUseError
 from rce_fleet.tasks.records import RECORD_TYPES, FleetEvent, GoalEntry, Record, Zone, key_of
 from rce_fleet.tasks.task import Task
 
@@ -99,7 +99,8 @@ class Journal:
         path: The file; its folder must exist.
 
     Raises:
-        JournalError: It cannot be opened, is used by another manager, or is of a newer release.
+        JournalInUseError: Another manager uses it.
+        JournalError: It cannot be opened, or is of a newer release.
 
     Attributes:
         id: Which journal it is. A new file has another one: its events are numbered from 1 again.
@@ -272,7 +273,7 @@ class Journal:
                 if "locked" not in str(error):
                     raise self._error(error, "opened") from error
                 if time.monotonic() > until:
-                    raise JournalError(
+                    raise JournalInUseError(
                         f"{self._path} is used by another fleet manager; end it, or give another file"
                     ) from error
             time.sleep(0.1)

@@ -21,7 +21,7 @@ from rce.aio.tasks import run_in_groups
 from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
 from rce.ros.types import TypesError
-from rce_fleet.exceptions import JournalError
+from rce_fleet.exceptions import JournalError, JournalInUseError
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import NO_ANSWER
@@ -329,7 +329,8 @@ async def serve() -> int | None:
     """Run the manager once; return the program's exit code, or None if another manager has taken over."""
     async with Node("fleet_manager") as node:
         parameters = await read_parameters(node, ManagerParameters)
-        if not await stand_by(node, "fleet manager", SERVICE):
+        turn = await stand_by(node, "fleet manager", SERVICE, then="opens its journal")
+        if not turn.is_due:
             return 0
         place = parameters.journal or os.environ.get(VOLUME_VARIABLE, "")
         if not place:
@@ -340,8 +341,10 @@ async def serve() -> int | None:
         try:
             journal = await asyncio.to_thread(open_journal, place)
         except (JournalError, OSError) as error:
-            node.log.error("the fleet manager cannot start: %s", error)  # noqa: TRY400 - the reason says it all
-            print(f"fleet_manager: {error}", file=sys.stderr)  # noqa: T201
+            is_held = isinstance(error, JournalInUseError) and turn.predecessor
+            reason = f"{error}. It may be hung: {turn.predecessor}" if is_held else str(error)
+            node.log.error("the fleet manager cannot start: %s", reason)  # noqa: TRY400 - it says it all
+            print(f"fleet_manager: {reason}", file=sys.stderr)  # noqa: T201
             return BAD_JOURNAL
         manager = ManagerNode(node, parameters, journal)
         await manager.run()

@@ -354,7 +354,7 @@ async def serve() -> int | None:
             print(f"fleet_planner: {error}", file=sys.stderr)  # noqa: T201
             return BAD_PARAMETERS
         warn_of_size(node, grid, settings)
-        if not await stand_by(node, "planner", SERVICE):
+        if not (await stand_by(node, "planner", SERVICE)).is_due:
             return 0
         for text in filter(None, (remark, *remarks)):
             node.log.warning("%s", text)

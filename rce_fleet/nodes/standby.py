@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -29,6 +30,19 @@ _PROBE_S = 2.0
 """Seconds in which a running program answers."""
 HUNG_S = 30.0
 """Seconds after which a program that accepts connections and does not answer is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """The end of standing by.
+
+    Attributes:
+        is_due: Whether to go on; False if the node was stopped meanwhile.
+        predecessor: Node and address of the program that was registered last; it may be hung; empty: none.
+    """
+
+    is_due: bool
+    predecessor: str = ""
 
 
 class _Presence(Enum):
@@ -55,7 +69,7 @@ async def serve_in_turn(serve: Callable[[], Awaitable[int | None]]) -> int:
     return code
 
 
-async def stand_by(node: Node, program: str, service: str) -> bool:
+async def stand_by(node: Node, program: str, service: str, then: str = "takes over") -> Turn:
     """Wait while another program of its kind serves this ROS graph.
 
     The registration of a program that was killed stays at the master; so the service's address is tried too.
@@ -66,16 +80,16 @@ async def stand_by(node: Node, program: str, service: str) -> bool:
         node: Running node, before it provides services.
         program: What it is, for people: ``planner``.
         service: The service that every program of its kind provides.
-
-    Returns:
-        Whether to go on; False if the node was stopped meanwhile.
+        then: What this one does after it has waited, for people.
     """
-    is_told, hung_since = False, 0.0
+    predecessor, is_told, hung_since = "", False, 0.0
     async with RpcClient() as rpc:
         master = MasterClient(node.master_uri, node.name, node.uri, rpc)
         while True:
             address = await _service_address(master, service)
             presence = await _look(address, service, node.name)
+            if address and not predecessor.endswith(address):
+                predecessor = await _provider(master, service, address)
             if presence is _Presence.GONE:
                 break
             if presence is _Presence.ANSWERS:
@@ -83,16 +97,16 @@ async def stand_by(node: Node, program: str, service: str) -> bool:
             elif not hung_since:
                 hung_since = time.monotonic()
                 node.log.error(
-                    "the other %s (%s at %s) accepts connections and does not answer: this one takes over"
+                    "the other %s (%s at %s) accepts connections and does not answer: this one %s"
                     " in %.0f s if that stays so",
-                    *(program, service, address, HUNG_S),
+                    *(program, service, address, then, HUNG_S),
                 )
             elif time.monotonic() - hung_since >= HUNG_S:
                 node.log.warning(
-                    "the other %s has not answered for %.0f s: this one takes over; end the other one",
-                    *(program, HUNG_S),
+                    "the other %s has not answered for %.0f s: this one %s; end the other one, %s",
+                    *(program, HUNG_S, then, predecessor),
                 )
-                return not node.is_shutdown
+                break
             if not is_told:
                 node.log.error(
                     "another %s serves this fleet (%s at %s): this one stands by until it ends",
@@ -102,10 +116,10 @@ async def stand_by(node: Node, program: str, service: str) -> bool:
                 )
                 is_told = True
             if not await node.sleep(_LOOK_EVERY):
-                return False
-    if is_told:
-        node.log.warning("the other %s has ended: this one takes over", program)
-    return not node.is_shutdown
+                return Turn(is_due=False)
+    if is_told and presence is _Presence.GONE:
+        node.log.warning("the other %s has ended: this one %s", program, then)
+    return Turn(not node.is_shutdown, predecessor)
 
 
 def successor(node: Node, graph: GraphState, service: str) -> str:
@@ -126,6 +140,16 @@ async def _service_address(master: MasterClient, service: str) -> str:
         return str(await master.call("lookupService", service))
     except MasterError:
         return ""
+
+
+async def _provider(master: MasterClient, service: str, address: str) -> str:
+    """Return the node that provides a service, and the service's address."""
+    try:
+        _, _, services = await master.call("getSystemState")
+        names = [str(node) for name, nodes in services if name == service for node in nodes]
+    except (MasterError, TypeError, ValueError):
+        names = []
+    return " at ".join((*names[:1], address))
 
 
 async def _look(address: str, service: str, caller: str) -> _Presence:

@@ -225,8 +225,32 @@ async def test_a_second_manager_stands_by_until_the_first_ends(tmp_path: Path) -
         del programs[said.partition(":")[0]]
         for first in programs.values():
             first.kill()
-        await judge.hears("the other fleet manager has ended: this one takes over")
+        await judge.hears("the other fleet manager has ended: this one opens its journal")
         await judge.hears("the fleet manager has 0 open tasks")
+
+
+async def test_a_hung_manager_with_the_same_journal_is_named(tmp_path: Path) -> None:
+    """It keeps its journal: the second one says which program people have to end."""
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        journal = f"_journal:={tmp_path / 'journal.sqlite'}"
+        first = await stack.enter_async_context(
+            fleet_program(core, "fleet_manager.py", "__name:=one", journal)
+        )
+        await judge.hears("/one: the fleet manager has 0 open tasks")
+        first.send_signal(signal.SIGSTOP)
+        stack.callback(_continue, first)
+        second = await stack.enter_async_context(
+            fleet_program(core, "fleet_manager.py", "__name:=two", journal)
+        )
+        await judge.hears("/two: the other fleet manager (/fleet/request at rosrpc://")
+        await judge.fill_backlog("/fleet/request")
+        await judge.hears("/two: the other fleet manager has ended: this one opens its journal")
+        said = await judge.hears("/two: the fleet manager cannot start: ")
+        assert "is used by another fleet manager; end it, or give another file" in said
+        assert "It may be hung: /one at rosrpc://" in said
+        async with asyncio.timeout(60):
+            assert await second.wait() == 2
 
 
 async def test_a_manager_without_its_journal_says_so(tmp_path: Path) -> None:
