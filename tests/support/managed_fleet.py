@@ -114,6 +114,10 @@ class ManagedFleet:
         await process.wait()
         stack.pop_all()
 
+    def signal(self, exe: str, number: int) -> None:
+        """Send a signal to planner or manager."""
+        self._programs[exe][1].send_signal(number)
+
     async def planner_zones(self) -> list[str]:
         """Return the ids of the planner's zones."""
         answer = await self._node.service_client("/fleet/get_state", "fleet/GetState").call({}, timeout=30)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import signal
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -85,6 +87,44 @@ async def test_modes_and_zones_survive_the_planner(tmp_path: Path) -> None:
 
         await until(is_out)
         assert (await fleet.ask("GET", "/robots/Robot2")).body["reason"] == "flat, by eve"
+
+
+async def test_ends_of_zones_follow_the_side_that_changed_them(tmp_path: Path) -> None:
+    """A program makes its zone permanent at the planner; a request gives it an end while that is stopped."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [0]) as fleet:
+
+        async def set_at_planner(lifetime: float) -> None:
+            gate = {"id": "gate", "kind": "blocked", "cells": [27], "lifetime": lifetime}
+            answer = await fleet.call("/fleet/set_zones", "fleet/SetZones", zones=[gate], revision=-1)
+            assert answer is not None
+            assert answer.ok, answer.message
+
+        async def end_at_manager() -> Any:
+            return (await fleet.ask("GET", "/zones/gate")).body.get("until", "not known")
+
+        async def ends_in_an_hour() -> bool:
+            return isinstance(end := await end_at_manager(), float) and end > time.time() + 3000.0
+
+        async def is_permanent() -> bool:
+            return await end_at_manager() is None
+
+        async def is_told_of_its_end() -> bool:
+            answer = await fleet.call("/fleet/get_state", "fleet/GetState")
+            return answer is not None and [zone.lifetime > 3000.0 for zone in answer.state.zones] == [True]
+
+        async with asyncio.timeout(LONGEST_S):
+            while await fleet.call("/fleet/get_state", "fleet/GetState") is None:
+                await asyncio.sleep(0.2)
+        await set_at_planner(3600.0)
+        await until(ends_in_an_hour)
+        await set_at_planner(0.0)
+        await until(is_permanent)
+        fleet.signal("fleet_planner.py", signal.SIGSTOP)
+        await asyncio.sleep(8.0)  # the manager notices after 5 s; else its call is only late
+        gate = {"kind": "blocked", "cells": [27], "until": time.time() + 7200.0}
+        assert (await fleet.ask("PUT", "/zones/gate", gate)).status == 200
+        fleet.signal("fleet_planner.py", signal.SIGCONT)
+        await until(is_told_of_its_end)
 
 
 async def test_a_task_goes_to_the_robot_that_need_not_drive_around_a_one_way_zone(tmp_path: Path) -> None:
