@@ -6,7 +6,9 @@
 * ``mapping``: drive an arc of 2 s while ``slam_gmapping`` makes a map. The task is done when the mapper has
   used the scan that was taken at the end.
 
-On the robot nothing crosses the link, so that it is measured with one link only.
+On the robot nothing crosses the link, so that it is measured with one link only. Links come in random order,
+and each task begins at the same place with each of them, in both places: else a stretch of the floor would
+count as a link's effect.
 """
 
 from __future__ import annotations
@@ -17,12 +19,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rce_fleet.drivers.robot_models import load_model
+from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench, Reading
 from rce_fleet.experiments.experiment import NETBOOK_CORES, Experiment, Measured, Options, Trial
 from rce_fleet.experiments.measures import Value, used
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.robot_energy import Effort, energy_of
-from rce_fleet.experiments.robot_places import CLOUD, MAPPING, NAVIGATION, ROBOT, TaskRobot, write_packages
+from rce_fleet.experiments.robot_places import (
+    CLOUD,
+    MAPPING,
+    NAVIGATION,
+    RETURN,
+    ROBOT,
+    TaskRobot,
+    write_packages,
+)
 from rce_fleet.experiments.systems.base import Layout, together
 from rce_fleet.experiments.systems.cloud import Cloud
 from rce_fleet.experiments.systems.software import software_of
@@ -47,15 +58,16 @@ class Link(NamedTuple):
 
 LINKS = (Link(50, 5), Link(50, 100), Link(0.5, 5), Link(0.3, 5))
 """The first one is the wireless LAN's; one has more delay, and two are as slow as what the robot sends."""
-START_X, Y = 0.5, 0.5
-STEP_M = 1.0
-"""How far a goal is ahead of the one before, along the floor's lower corridor, metres."""
+START = (2.5, 0.5)
+"""Where each drive begins, looking along x: in the floor's lower corridor, away from its corners; metres."""
+GOAL = {"x": 3.5, "y": 0.5, "yaw": 0.0}
+"""Where each drive to a goal leads."""
 FAR = {"x": 7.5, "y": 7.5, "yaw": 0.0}
 """Where plans lead."""
 PLANS = 4
 DRIVE_S = 2.0
 ARC = {"speed": 0.3, "turn_rate": 0.6}
-"""The arc of the mapper's drive, m/s and rad/s; every second one is driven backward."""
+"""The arc of the mapper's drive, m/s and rad/s; the way back along it does not count."""
 PATIENCE_S = 8.0
 """A task that is not done by then has failed: its time counts as this, and is more in truth."""
 PLANS_S = 4.0
@@ -68,7 +80,9 @@ ANSWERS = {NAVIGATION: "command", MAPPING: "pose"}
 MODEL = "turtlebot2"
 SETTLE_S = 0.3
 """From a change of the link, or of the share of a core, to the next task."""
-START_S = {ROBOT: 9.0, CLOUD: 14.0}
+BACK_S = {NAVIGATION: 1.5, MAPPING: 3.0}
+"""About how long the way back to the start takes, for the plan."""
+START_S = {ROBOT: 3.0, CLOUD: 8.0}
 TASK_S = {NAVIGATION: 5.0, PLANNING: 1.5, MAPPING: 3.0}
 """About how long all takes, for the plan."""
 
@@ -90,8 +104,10 @@ class Offload(Experiment):
         return self._seconds(setup, options, len(links_of(dict(setup.factors)["place"], options)))
 
     def _seconds(self, setup: Condition, options: Options, links: int) -> float:
-        each = sum(TASK_S[task] + SETTLE_S for task in tasks_of(options))
-        return START_S[dict(setup.factors)["place"]] + each * links
+        tasks = tasks_of(options)
+        each = sum(TASK_S[task] + SETTLE_S for task in tasks)
+        back = links * BACK_S[NAVIGATION] + (links - 1) * (BACK_S[MAPPING] if MAPPING in tasks else 0.0)
+        return START_S[dict(setup.factors)["place"]] + each * links + back
 
     def warm_up_seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes with one link only."""
@@ -100,14 +116,11 @@ class Offload(Experiment):
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run the tasks in one place, over all links in random order."""
         place = dict(trial.setup.factors)["place"]
-        draw = np.random.default_rng(trial.seed)
-        links = in_order(links_of(place, trial.options), draw)[: 1 if trial.is_warm_up else None]
+        links = links_of(place, trial.options)[: 1 if trial.is_warm_up else None]
+        order = np.random.default_rng(trial.seed).permutation(len(links))
         async with Bench(seed=trial.seed) as bench:
             cloud = Cloud(bench, software_of(trial.setup.software), Layout()) if place == CLOUD else None
-            # On the robot only one stretch of the corridor is driven: any of them.
-            first = int(draw.integers(len(LINKS))) if cloud is None else 0
-            run = _Run(trial, bench, cloud, START_X + STEP_M * first)
-            return await run.measure(links)
+            return await _Run(trial, bench, cloud).measure([links[index] for index in order])
 
 
 class _Run:
@@ -117,16 +130,13 @@ class _Run:
         trial: The run.
         bench: Its machines.
         cloud: Where the nodes run; None: on the robot.
-        start: Where the robot begins on the corridor, metres.
     """
 
-    def __init__(self, trial: Trial, bench: Bench, cloud: Cloud | None, start: float) -> None:
+    def __init__(self, trial: Trial, bench: Bench, cloud: Cloud | None) -> None:
         self._trial = trial
         self._bench = bench
         self._cloud = cloud
-        self._at = start
-        self._robot = TaskRobot(bench, (start, Y))
-        self._direction = 1
+        self._robot = TaskRobot(bench, START)
         self._found: list[Measured] = []
 
     async def measure(self, links: Sequence[Link]) -> list[Measured]:
@@ -146,9 +156,25 @@ class _Run:
                 await asyncio.sleep(SETTLE_S)
                 for task in own:
                     await self._do(task, link)
+                if (nodes, link) != (MAPPING, links[-1]):
+                    await self._go_back(nodes)
             await self._set(LINKS[0], 0.0)
             await self._robot.end_nodes()
         return self._found
+
+    async def _go_back(self, nodes: str) -> None:
+        """Have the robot where the nodes' tasks begin, over a link that also empties the last one's queues.
+
+        Raises:
+            ExperimentError: It was not found there.
+        """
+        await self._set(LINKS[0], 0.0)
+        await asyncio.sleep(SETTLE_S)
+        if nodes == MAPPING:
+            # It does not count: the map need not be good.
+            await self._robot.do(MAPPING, QUICK_PATIENCE_S, **drive(-1))
+        elif not (await self._robot.do(RETURN, READY_S, x=START[0], y=START[1], yaw=0.0))["success"]:
+            raise ExperimentError(f"the robot was not localized at its start within {READY_S:g} s")
 
     async def _set(self, link: Link, cores: float) -> None:
         """Give the client a link and a share of a core."""
@@ -159,7 +185,7 @@ class _Run:
 
     async def _do(self, task: str, link: Link) -> None:
         readings = await self._read()
-        report = await self._robot.do(task, self._patience(task), **self._order(task))
+        report = await self._robot.do(task, self._patience(task), **order_of(task))
         later = await self._read()
         values = [value for machine in readings for value in used(machine, readings[machine], later[machine])]
         factors = {"task": task, "rate": f"{link.rate:g}", "delay": f"{link.delay:g}"}
@@ -176,21 +202,17 @@ class _Run:
     async def _read(self) -> dict[str, Reading]:
         return {machine: await self._bench.read(machine) for machine in (CLIENT, SERVER)}
 
-    def _order(self, task: str) -> Mapping[str, float]:
-        """Return what belongs to the next task of a kind."""
-        if task == PLANNING:
-            return {**FAR, "plans": PLANS}
-        if task == NAVIGATION:
-            self._at += STEP_M
-            return {"x": self._at, "y": Y, "yaw": 0.0}
-        self._direction = -self._direction
-        return {**{name: self._direction * value for name, value in ARC.items()}, "drive_s": DRIVE_S}
+
+def order_of(task: str) -> Mapping[str, float]:
+    """Return what belongs to each task of a kind."""
+    if task == PLANNING:
+        return {**FAR, "plans": PLANS}
+    return GOAL if task == NAVIGATION else drive(1)
 
 
-def in_order(links: Sequence[Link], draw: np.random.Generator) -> list[Link]:
-    """Return links in random order, but those with less rate later: they leave filled queues."""
-    shuffled = [links[index] for index in draw.permutation(len(links))]
-    return sorted(shuffled, key=lambda link: -link.rate)
+def drive(direction: int) -> Mapping[str, float]:
+    """Return the order of the mapper's drive, forward (1) or backward (-1)."""
+    return {**{name: direction * value for name, value in ARC.items()}, "drive_s": DRIVE_S}
 
 
 def links_of(place: str, options: Options) -> Sequence[Link]:

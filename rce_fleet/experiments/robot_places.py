@@ -17,6 +17,7 @@ from rce_fleet.compiled import COMPILED
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, POLL_S
 from rce_fleet.experiments.systems.base import core_uri
+from rce_fleet.experiments.task_judge import ROBOT_NAME, WORLD_PORT
 from rce_fleet.experiments.workloads.telling import reports
 from rce_fleet.turtlebot_wiring import moved_nodes
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 ROBOT, CLOUD = "robot", "cloud"
 NAVIGATION, MAPPING = "navigation", "mapping"
+RETURN = "return"
+"""The robot is put where it began, and ``amcl`` is told so."""
 LAUNCH_FILE = "turtlebot/tasks.launch"
 CONTAINER = "box"
 NUMPY = {COMPILED: "no"}
@@ -51,11 +54,12 @@ UP = (
     ("/tf", "tf2_msgs/TFMessage"),
     ("/tf_static", "tf2_msgs/TFMessage"),
 )
-"""What the robot sends to its container for each task; those of navigation get goals too."""
+"""What the robot sends to its container for each task; those of navigation get goals and initial poses."""
 UP_FOR = {
     NAVIGATION: (
         ("/move_base_simple/goal", "geometry_msgs/PoseStamped"),
         ("/move_base/cancel", "actionlib_msgs/GoalID"),
+        ("/initialpose", _POSE),
     ),
     MAPPING: (),
 }
@@ -95,7 +99,7 @@ class TaskRobot:
         bench = self._bench
         scene = bench.folder / "scene.json"
         scene.write_text(json.dumps(scene_of_one_robot(self._start)))
-        ports = ("--core-port", core_uri(LOCAL).rsplit(":", 1)[1].strip("/"), "--world-port", "0")
+        ports = ("--core-port", core_uri(LOCAL).rsplit(":", 1)[1].strip("/"), "--world-port", str(WORLD_PORT))
         simulation = ("rce", "sim", str(scene), "--no-stand-ins", *ports)
         await bench.start(CLIENT, "hardware", simulation, ready="simulation ready", is_metered=False)
         judge = (sys.executable, "-m", "rce_fleet.experiments.task_judge", "--orders", str(self._orders))
@@ -172,7 +176,7 @@ class TaskRobot:
 def scene_of_one_robot(start: tuple[float, float]) -> dict[str, Any]:
     """Return the demo's floor with one robot, which begins somewhere."""
     scene: dict[str, Any] = yaml.safe_load((configs_dir() / "scene.yaml").read_text(encoding="utf-8"))
-    scene["robots"] = [{"id": "Robot1", "at": list(start), "sensor": "lidar"}]
+    scene["robots"] = [{"id": ROBOT_NAME, "at": list(start), "sensor": "lidar"}]
     return scene
 
 

@@ -11,15 +11,18 @@ import argparse
 import json
 from bisect import bisect_right
 from itertools import pairwise
-from math import dist
+from math import dist, pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from rce.ros.node import Message, Node, Publisher, ServiceClient, ServiceError, run
 from rce_fleet.experiments.workloads.telling import tell, tell_ready
 from rce_fleet.geometry.angles import wrap
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.nodes.planar import pose_fields, read_pose, twist_fields
+from rce_fleet.nodes.pose_messages import pose_with_covariance_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -36,9 +39,17 @@ STILL_S = 0.3
 """A scan that is taken so long after the last command is of a standing robot."""
 OFF_M, OFF_RAD = 0.15, 0.15
 """A map is good if by it the robot moved as it did, but for this."""
+SETTLED_S = 0.5
+"""After so long scans that were taken before the robot was moved, and commands made of them, are there."""
 CALL_S = 2.0
 """A call of a service that may not be there yet is made again after so long."""
 FRAME = "map"
+ROBOT_NAME = "Robot1"
+"""Of the robot, in the simulation."""
+WORLD_PORT = 11310
+"""Port of the simulation's own core, which has its services."""
+START_COVARIANCE = np.diag((0.25, 0.25, (pi / 12) ** 2))
+"""Of x, y and yaw, as ``amcl`` has it at its start by default."""
 
 
 class Answer(NamedTuple):
@@ -53,10 +64,12 @@ class Judge:
 
     Args:
         node: A running node in the robot's graph.
+        world: One in that of the simulation.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, world: Node) -> None:
         self._node = node
+        self._world = world
         self._truth: list[Pose] = []
         """Where the robot was since the task began."""
         self._speed = Twist()
@@ -70,7 +83,9 @@ class Judge:
         self._goals: Publisher
         self._cancels: Publisher
         self._commands: Publisher
+        self._starts: Publisher
         self._plans: ServiceClient
+        self._moves: ServiceClient
 
     async def start(self) -> None:
         """Join the graph."""
@@ -79,7 +94,9 @@ class Judge:
         self._cancels = await node.advertise("/move_base/cancel", "actionlib_msgs/GoalID")
         self._commands = await node.advertise("/raw_cmd_vel", "geometry_msgs/Twist")
         self._plans = node.service_client("/move_base/make_plan", "nav_msgs/GetPlan", persistent=False)
+        self._moves = self._world.service_client("/simulation/move", "gazebo_msgs/SetModelState")
         pose = "geometry_msgs/PoseWithCovarianceStamped"
+        self._starts = await node.advertise("/initialpose", pose)
         await node.subscribe("/ground_truth/pose", "nav_msgs/Odometry", self._take_truth)
         await node.subscribe("/scan", "sensor_msgs/LaserScan", self._take_scan)
         await node.subscribe("/pose", pose, self._take_mapped)
@@ -95,7 +112,8 @@ class Judge:
 
         Args:
             order: ``task`` is ``navigation``, ``mapping`` or ``planning``, which are measured, or
-                ``await_navigation`` or ``await_mapping``: wait until its nodes do what they are for.
+                ``await_navigation`` or ``await_mapping``: wait until its nodes do what they are for; or
+                ``return``: the robot is put somewhere, and is localized there as at its start.
         """
         self._began = self._node.time()
         self._answers = {}
@@ -109,6 +127,7 @@ class Judge:
             "planning": self._plan,
             "await_navigation": self._await_navigation,
             "await_mapping": self._await_mapping,
+            "return": self._return,
         }
         success = await actions[order["task"]](order)
         return {
@@ -164,6 +183,24 @@ class Judge:
             else:
                 await self._node.sleep(POLL_S)
         return True
+
+    async def _return(self, order: dict[str, Any]) -> bool:
+        """Put the robot somewhere, and wait until ``amcl``, which is told so, has used a scan from there."""
+        at = Pose(order["x"], order["y"], order["yaw"])
+        if not await self._until(lambda: self._stands, order["patience"]):
+            return False
+        await self._node.sleep(SETTLED_S)
+        state = {"model_name": ROBOT_NAME, "pose": pose_fields(at)}
+        if not (await self._moves.call({"model_state": state}, timeout=order["patience"])).success:
+            return False
+        await self._node.sleep(SETTLED_S)
+        told = self._node.now()
+        self._starts.publish(
+            header={"stamp": told, "frame_id": FRAME}, pose=pose_with_covariance_fields(at, START_COVARIANCE)
+        )
+        return await self._until(
+            lambda: any(one.stamp > told.to_sec() for one in self._answers.get("pose", ())), order["patience"]
+        )
 
     async def _await_navigation(self, order: dict[str, Any]) -> bool:
         """Wait until plans are answered and a pose has been found."""
@@ -252,8 +289,9 @@ async def main() -> None:
     parser = argparse.ArgumentParser(prog="task_judge", description=__doc__)
     parser.add_argument("--orders", type=Path, required=True)
     options = parser.parse_args()
-    async with Node("task_judge", argv=[]) as node:
-        judge = Judge(node)
+    world = Node("task_judge", argv=[], master_uri=f"http://127.0.0.1:{WORLD_PORT}/")
+    async with Node("task_judge", argv=[]) as node, world:
+        judge = Judge(node, world)
         await judge.start()
         tell_ready()
         done = 0

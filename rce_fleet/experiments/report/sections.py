@@ -145,9 +145,10 @@ SECTIONS = (
         "crosses the link, so one link is enough), or in the cloud (`place=cloud`), over the link's `rate` "
         "in Mbit/s and `delay` in milliseconds in each direction. `task=navigation` drives 1 m to a goal by "
         "AMCL and `move_base`, `task=planning` asks for a plan across the floor, and `task=mapping` makes a "
-        "map of an arc of 2 s. `control_delay` is the time from a scan's stamp until a command or pose that "
-        "was made of it, or of a newer scan, is at the robot. A task that is not done within 8 s (4 s for "
-        "four plans) has failed: its time counts as that. Energy is computed by the robot's model. "
+        "map of an arc of 2 s. All begin at the same place of the floor, over every link and in both places; "
+        "links come in random order. `control_delay` is the time from a scan's stamp until a command or pose "
+        "that was made of it, or of a newer scan, is at the robot. A task that is not done within 8 s (4 s "
+        "for four plans) has failed: its time counts as that. Energy is computed by the robot's model. "
         "Of the tables about break-even, the first one takes the cloud as faster where a verdict would (the "
         "intervals do not overlap, and the medians differ by 5 %); the second one says where the medians "
         "cross, however little they differ.",
