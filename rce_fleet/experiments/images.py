@@ -52,7 +52,9 @@ class Images(Experiment):
 
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
-        return START_S + len(parts(options, setup)) * (SETTLE_S + options.seconds)
+        return START_S + sum(
+            part.seconds(options.seconds) + max(SETTLE_S, 1 / part.rate) for part in parts(options, setup)
+        )
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""
@@ -93,18 +95,18 @@ class Shot(NamedTuple):
 def parts(options: Options, setup: Condition) -> list[Part]:
     """Return what is measured in each run: the main condition, and with the first software further ones.
 
-    The rate that the link cannot carry comes last: what is left of it in queues is sent for seconds, and
-    would count in the part after it.
+    PNG comes early: the converter's worker ends after 10 s without work, and the start of another one would
+    count. The rate that the link cannot carry comes last: what is left of it in queues is sent for seconds.
     """
     found = [_part(MAIN_SIZE, RAW)]
     if setup.software != options.software[0]:
         return found
+    if setup.system == "cloud":
+        found.append(_part(MAIN_SIZE, PNG))
     if not options.quick:
         found += [_part(size, RAW) for size in SIZES if size != MAIN_SIZE]
         found.append(_part(MAIN_SIZE, RAW, mode=QUIET))
     found.append(_part(MAIN_SIZE, JPEG))
-    if setup.system == "cloud":
-        found.append(_part(MAIN_SIZE, PNG))
     if not options.quick:
         found.append(_part(MAIN_SIZE, RAW, is_above=True))
     return found
@@ -118,7 +120,7 @@ def _part(size: str, encoding: str, *, is_above: bool = False, mode: str = PRINT
         "printed": "yes" if mode == PRINTED else "no",
     }
     rate = ABOVE_HZ if is_above else CARRIED_HZ[size]
-    return Part(factors, mode, rate, stream=f"{encoding} {size}")
+    return Part(factors, mode, rate, stream=f"{encoding} {size}", is_whole=not is_above)
 
 
 def write_images(listing: Path, encodings: list[str], sizes: list[str]) -> None:

@@ -19,6 +19,8 @@ MICRO = 1e-6
 LATE_S = 0.5
 """Messages younger than this at the end of the measurement may be under way: they do not count as lost."""
 PERCENTILES = (50, 95, 99)
+FEWEST_OF_TAILS = 20
+"""Of fewer delays only the median is told: the other percentiles would be the largest one."""
 
 
 class Value(NamedTuple):
@@ -36,9 +38,16 @@ class Sample(NamedTuple):
     arrival: int
 
 
-def used(machine: str, first: Reading, last: Reading) -> list[Value]:
-    """Return what a machine used between two readings, per second."""
-    seconds = last.at - first.at
+def used(machine: str, first: Reading, last: Reading, seconds: float = 0.0) -> list[Value]:
+    """Return what a machine used between two readings, per second.
+
+    Args:
+        machine: The machine.
+        first: The first reading.
+        last: The last one.
+        seconds: By how many seconds it is divided; 0: by those between the readings.
+    """
+    seconds = seconds or last.at - first.at
     rates = {
         "cpu": (last.usage.cpu_s - first.usage.cpu_s, "cores"),
         "network_in": (last.traffic.received_bytes - first.traffic.received_bytes, "B/s"),
@@ -71,7 +80,8 @@ def delivered(
     sent: Mapping[str, Sequence[int]],
     received: Mapping[str, Iterable[Sample]],
     window: tuple[float, float],
-    carried: float,
+    sent_s: float = 0.0,
+    arrived_s: float = 0.0,
 ) -> list[Value]:
     """Return how messages were delivered within a window.
 
@@ -79,28 +89,61 @@ def delivered(
         sent: Stamps of what was sent on each topic, microseconds since 1970.
         received: What arrived on each topic.
         window: Begin and end of the measurement, seconds since 1970.
-        carried: Bytes that machine 1 sent and received in the window.
+        sent_s: For how many seconds messages were sent in it; 0: all the time.
+        arrived_s: For how many they arrived, at an even rate; 0: all the time.
     """
     begin, end = window
-    seconds = end - begin
     topics = max(1, len(sent))
     inside = [stamp for stamps in sent.values() for stamp in stamps if begin <= stamp * MICRO < end]
-    arrived = [sample for samples in received.values() for sample in samples]
-    there = [sample for sample in arrived if begin <= sample.arrival * MICRO < end]
+    there = _arrived(received, window)
     found = [
-        Value("rate", len(inside) / seconds / topics, "Hz"),
-        Value("received", len(there) / seconds / topics, "Hz"),
+        Value("rate", len(inside) / (sent_s or end - begin) / topics, "Hz"),
+        Value("received", len(there) / (arrived_s or end - begin) / topics, "Hz"),
     ]
     if there:
         delays = np.array([sample.arrival - sample.stamp for sample in there]) * MICRO
-        figures = np.percentile(delays, PERCENTILES)
+        shares = PERCENTILES if len(there) >= FEWEST_OF_TAILS else PERCENTILES[:1]
+        figures = np.percentile(delays, shares)
         found += [
             Value(f"delay_p{share}", float(figure), "s")
-            for share, figure in zip(PERCENTILES, figures, strict=True)
+            for share, figure in zip(shares, figures, strict=True)
         ]
-        found.append(Value("message_bytes", carried / len(there), "B"))
     lost = _lost(sent, received, begin, end)
     return found if lost is None else [*found, Value("lost", lost, "")]
+
+
+def message_bytes(
+    received: Mapping[str, Iterable[Sample]], window: tuple[float, float], carried: float
+) -> list[Value]:
+    """Return the bytes that were carried for each message that arrived; none if nothing did.
+
+    Args:
+        received: What arrived on each topic.
+        window: Between which times, seconds since 1970.
+        carried: Bytes that machine 1 sent and received between them.
+    """
+    there = _arrived(received, window)
+    return [Value("message_bytes", carried / len(there), "B")] if there else []
+
+
+def lasted(received: Mapping[str, Sequence[Sample]], sent_s: float) -> float:
+    """Return for how long messages arrived at an even rate, seconds, if all of them are measured.
+
+    So long as they were sent, or longer where they arrived at a lower rate: the time from the first arrival
+    to the last one is that of all messages but one.
+    """
+    found = [sent_s]
+    for samples in received.values():
+        arrivals = sorted(sample.arrival for sample in samples)
+        if len(arrivals) > 1:
+            found.append((arrivals[-1] - arrivals[0]) * MICRO * len(arrivals) / (len(arrivals) - 1))
+    return max(found)
+
+
+def _arrived(received: Mapping[str, Iterable[Sample]], window: tuple[float, float]) -> list[Sample]:
+    begin, end = window
+    arrived = [sample for samples in received.values() for sample in samples]
+    return [sample for sample in arrived if begin <= sample.arrival * MICRO < end]
 
 
 def _lost(

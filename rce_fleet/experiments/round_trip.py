@@ -56,7 +56,7 @@ class RoundTrip(Experiment):
         found = START_S
         for origin, delay, _ in rounds_of(setup, options):
             trips = trips_of(setup, options, origin, delay)
-            found += 2.0 + sum(number * (0.02 + 2 * size / TRIP_RATE) for size, number in trips.items())
+            found += 0.5 + sum(number * (0.02 + 2 * size / TRIP_RATE) for size, number in trips.items())
         return found
 
     async def measure(self, trial: Trial) -> list[Measured]:

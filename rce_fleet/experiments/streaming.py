@@ -6,8 +6,8 @@ import asyncio
 import time
 from dataclasses import dataclass
 from itertools import chain, count
-from math import ceil
-from typing import TYPE_CHECKING
+from math import ceil, inf
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Reading
@@ -19,10 +19,12 @@ from rce_fleet.experiments.measures import (
     by_topic,
     carried_bytes,
     delivered,
+    lasted,
+    message_bytes,
     over_time,
     used,
 )
-from rce_fleet.experiments.workloads.control import END, Phase, give
+from rce_fleet.experiments.workloads.control import END, NOTHING, Phase, give
 from rce_fleet.experiments.workloads.telling import reports
 
 if TYPE_CHECKING:
@@ -37,6 +39,15 @@ STEP_S = 0.5
 DRAIN_S = 30.0
 """How long messages may be under way after the last part, seconds."""
 POLL_S = 0.3
+FEWEST = 3
+"""Messages of each topic in a part that is measured whole, at least."""
+STILL_S = 0.2
+"""Machines are still that use so long less than the following."""
+STILL_B_S = 50_000.0
+STILL_CORES = 0.08
+PAUSE = Phase("pause", stream=NOTHING)
+PATIENCE_S = 10.0
+"""Machines that are not still after so long are not waited for, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +61,8 @@ class Part:
         stream: Which stream; empty: all.
         client_cores: Share of a core that the client has; 0: all that there is.
         work_s: Processor time that making a message takes, seconds.
+        is_whole: Whether it is measured from before its first message until the last one has arrived, so
+            that all bytes and work belong to its messages, also to few large ones; else in the middle.
     """
 
     factors: Mapping[str, str]
@@ -58,6 +71,19 @@ class Part:
     stream: str = ""
     client_cores: float = 0.0
     work_s: float = 0.0
+    is_whole: bool = False
+
+    def seconds(self, wanted: float) -> float:
+        """Return how long it is measured: so long as wanted, or whole periods if it is measured whole."""
+        return max(FEWEST, round(wanted * self.rate)) / self.rate if self.is_whole else wanted
+
+
+class _Moment(NamedTuple):
+    """All meters at about the same time."""
+
+    server: Reading
+    client: Reading
+    emulation_s: float
 
 
 @dataclass(slots=True)
@@ -65,13 +91,23 @@ class _Watched:
     """What was read during a part.
 
     Attributes:
-        due: When the server was read after the first time, as planned, seconds.
+        before: Before the first message of the part.
+        begin: At the begin of the measurement.
+        after: From the planned end until all was still.
+        server: Machine 1 at the begin, and when it was ``due``.
+        due: As planned, seconds after the begin.
     """
 
+    before: _Moment
+    begin: _Moment
+    after: list[_Moment]
     server: list[Reading]
-    client: list[Reading]
     due: list[float]
-    emulation_s: float
+
+    def end_of(self, received: Mapping[str, Sequence[Sample]]) -> _Moment:
+        """Return the first moment after the part at which all that arrived was there."""
+        last = max((sample.arrival for samples in received.values() for sample in samples), default=0)
+        return next((one for one in self.after if one.server.at > last * MICRO), self.after[-1])
 
 
 class Streaming:
@@ -115,14 +151,20 @@ class Streaming:
         """
         for listener in self._listeners:
             await listener.wait_ready()
-        watched = [await self._watch(f"{number}", part, seconds) for number, part in enumerate(parts)]
+        waits = any(part.is_whole for part in parts)
+        if waits:
+            give(self._control, PAUSE)
+            await self._still(STILL_S)
+        watched = [
+            await self._watch(f"{number}", part, seconds, waits=waits) for number, part in enumerate(parts)
+        ]
         self._limit(0.0)
         if after is not None:
             await after()
         give(self._control, Phase("end", END))
         sent, received = await asyncio.gather(self._told(self._sources), self._told(self._listeners))
         return [
-            (part, self._values(watched[number], sent, received, f"{number}"))
+            (part, values_of(part, watched[number], sent, received, f"{number}"))
             for number, part in enumerate(parts)
         ]
 
@@ -136,7 +178,7 @@ class Streaming:
         for listener in self._listeners:
             await listener.wait_ready()
         watched = await self._watch(name, part, seconds)
-        give(self._control, Phase("pause"))
+        give(self._control, PAUSE)
         deadline = time.monotonic() + DRAIN_S
         while not (found := by_topic(await self._told_so_far(), name)):
             if time.monotonic() > deadline:
@@ -150,20 +192,47 @@ class Streaming:
     async def _told_so_far(self) -> list[dict[str, object]]:
         return [report for source in self._sources for report in reports(await source.lines())]
 
-    async def _watch(self, name: str, part: Part, seconds: float) -> _Watched:
+    async def _watch(self, name: str, part: Part, seconds: float, *, waits: bool = False) -> _Watched:
+        """Do a part, and read what is used; if it waits, until nothing of the part is under way."""
         self._limit(part.client_cores)
+        before = await self._moment()
         give(self._control, Phase(name, part.mode, part.rate, part.stream, part.work_s))
-        await asyncio.sleep(SETTLE_S)
-        emulation = await self._bench.emulation_s()
-        client = [await self._bench.read(CLIENT)]
-        server = [await self._bench.read(SERVER)]
-        begin, due = time.monotonic(), readings_due(seconds)
+        if not part.is_whole:
+            await asyncio.sleep(SETTLE_S)
+        moment = before if part.is_whole else await self._moment()
+        server, begin, due = [moment.server], time.monotonic(), readings_due(part.seconds(seconds))
+        # Sources look at the phase now and then: half a period early, and none begins another message.
+        pausing = [due[-1] - 0.5 / part.rate] if part.is_whole else []
         for at in due:
+            if pausing and pausing[0] < at:
+                await asyncio.sleep(max(0.0, begin + pausing.pop() - time.monotonic()))
+                give(self._control, PAUSE)
             await asyncio.sleep(max(0.0, begin + at - time.monotonic()))
             server.append(await self._bench.read(SERVER))
-        client.append(await self._bench.read(CLIENT))
+        after = [_Moment(server[-1], await self._bench.read(CLIENT), await self._bench.emulation_s())]
+        if waits:
+            give(self._control, PAUSE)
+            # A system may wait without any work; if it carries the rate, no wait is longer than a period.
+            after += await self._still(max(STILL_S, 1 / part.rate))
         self._bench.check()
-        return _Watched(server, client, due, await self._bench.emulation_s() - emulation)
+        return _Watched(before if waits else moment, moment, after, server, due)
+
+    async def _moment(self) -> _Moment:
+        emulation = await self._bench.emulation_s()
+        client = await self._bench.read(CLIENT)
+        return _Moment(await self._bench.read(SERVER), client, emulation)
+
+    async def _still(self, seconds: float) -> list[_Moment]:
+        """Wait until the machines have been still for some seconds; return all moments meanwhile."""
+        found = [await self._moment()]
+        since = found[0].server.at
+        deadline = time.monotonic() + PATIENCE_S
+        while found[-1].server.at - since < seconds and time.monotonic() < deadline:
+            await asyncio.sleep(STILL_S)
+            found.append(await self._moment())
+            if not is_still(*found[-2:]):
+                since = found[-1].server.at
+        return found
 
     def _limit(self, cores: float) -> None:
         meter = self._bench.meters[CLIENT]
@@ -173,27 +242,52 @@ class Streaming:
     async def _told(self, workloads: Sequence[RunningWorkload]) -> list[dict[str, object]]:
         return list(chain.from_iterable([await told(workload, DRAIN_S) for workload in workloads]))
 
-    def _values(
-        self,
-        watched: _Watched,
-        sent: Sequence[Mapping[str, object]],
-        received: Sequence[Mapping[str, object]],
-        name: str,
-    ) -> list[Value]:
-        server, client = watched.server, watched.client
-        first, last = server[0], server[-1]
-        stamps = {topic: [one[0] for one in samples] for topic, samples in by_topic(sent, name).items()}
-        arrivals = {
-            topic: [Sample(*one) for one in samples] for topic, samples in by_topic(received, name).items()
-        }
-        seconds = client[-1].at - client[0].at
-        return [
-            *used(SERVER, first, last),
-            *used(CLIENT, client[0], client[-1]),
-            Value("link.cpu", watched.emulation_s / seconds, "cores"),
-            *delivered(stamps, arrivals, (first.at, last.at), carried_bytes(first, last)),
-            *over_time(server, watched.due),
-        ]
+
+def values_of(
+    part: Part,
+    watched: _Watched,
+    sent: Sequence[Mapping[str, object]],
+    received: Sequence[Mapping[str, object]],
+    name: str,
+) -> list[Value]:
+    """Return the values of a part.
+
+    Args:
+        part: The part.
+        watched: What was read.
+        sent: What sources told.
+        received: What listeners told.
+        name: Of the part's phase.
+    """
+    stamps = {topic: [one[0] for one in samples] for topic, samples in by_topic(sent, name).items()}
+    arrivals = {
+        topic: [Sample(*one) for one in samples] for topic, samples in by_topic(received, name).items()
+    }
+    before, begin, there = watched.before, watched.begin, watched.end_of(arrivals)
+    end = there if part.is_whole else watched.after[0]
+    sent_s = watched.due[-1] if part.is_whole else 0.0
+    seconds = lasted(arrivals, sent_s) if part.is_whole else 0.0
+    emulation = (end.emulation_s - begin.emulation_s) / (seconds or end.client.at - begin.client.at)
+    window = begin.server.at, end.server.at
+    # After a wait, all that arrived belongs to what was carried.
+    whole = window if len(watched.after) == 1 else (before.server.at, inf)
+    return [
+        *used(SERVER, begin.server, end.server, seconds),
+        *used(CLIENT, begin.client, end.client, seconds),
+        Value("link.cpu", emulation, "cores"),
+        *delivered(stamps, arrivals, window, sent_s, seconds),
+        *message_bytes(arrivals, whole, carried_bytes(before.server, there.server)),
+        *over_time(watched.server, watched.due),
+    ]
+
+
+def is_still(before: _Moment, after: _Moment) -> bool:
+    """Return whether both machines carried and worked almost nothing between two moments."""
+    return all(
+        carried_bytes(first, last) < STILL_B_S * (last.at - first.at)
+        and last.usage.cpu_s - first.usage.cpu_s < STILL_CORES * (last.at - first.at)
+        for first, last in ((before.server, after.server), (before.client, after.client))
+    )
 
 
 def readings_due(seconds: float) -> list[float]:

@@ -83,7 +83,10 @@ SECTIONS = (
         "Images",
         "Images go from machine 2 to machine 1, which prints them on a console (`printed=yes`) or not. "
         "`rate=carried` is a rate at which the link carries raw images of that size: 20 Hz for 160x120, 3 Hz "
-        "for 640x480, 0.5 Hz for 1920x1080. `rate=above` asks for 30 Hz, more than the link carries. "
+        "for 640x480, 0.5 Hz for 1920x1080. It is measured from before the first message until the last one "
+        "has arrived, and a next part begins when nothing of it is under way: all bytes and CPU time belong "
+        "to its messages. `rate=above` asks for 30 Hz, more than the link carries; its `message_bytes` is of "
+        "all of its messages, the other figures of 3 s in the middle. "
         "`encoding=png` is made by a converter of the engine, so only CRS has it.",
         (_DELIVERY, _TRAFFIC, _USE),
     ),

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 PRINTED, QUIET, END = "printed", "quiet", "end"
 START = "start"
 """Name of the phase before the first one, in which sources send small messages until all are connected."""
+NOTHING = "-"
+"""The stream of a phase in which nothing is sent."""
 
 
 class Phase(NamedTuple):
@@ -21,7 +23,7 @@ class Phase(NamedTuple):
         mode: ``printed`` if listeners print the messages, ``quiet`` if they only take them, ``end`` if all
             programs shall tell what they have seen.
         rate: Messages that are to be sent, per second and topic.
-        stream: Which of its streams the source sends; empty: all.
+        stream: Which of its streams the source sends; empty: all; ``-``: none.
         work_s: Processor time that the source uses before each message, as a simulator to make it, seconds.
     """
 

@@ -13,6 +13,7 @@ from PIL import Image
 from rce_fleet.experiments.experiment import Options
 from rce_fleet.experiments.images import JPEG, PNG, RAW, Images, parts, picture, shot_of, write_images
 from rce_fleet.experiments.results import Condition
+from rce_robot.conversion.pool import ConversionSettings
 
 
 def test_pictures_differ_and_compress_as_a_cameras() -> None:
@@ -53,6 +54,14 @@ def test_rate_above_the_link_comes_last() -> None:
     rates = [part.factors["rate"] for part in parts(Options(), setup_of("cloud"))]
     assert rates.count("above") == 1
     assert rates[-1] == "above"
+
+
+def test_png_comes_while_the_converters_worker_is_there() -> None:
+    """Else the worker's start would count as the work for an image."""
+    measured = parts(Options(), setup_of("cloud"))
+    (at,) = (number for number, part in enumerate(measured) if part.factors["encoding"] == PNG)
+    before = sum(part.seconds(Options().seconds) + 1 / part.rate for part in measured[:at])
+    assert before < 0.5 * ConversionSettings().idle
 
 
 def test_further_software_has_the_main_condition_only() -> None:
