@@ -16,6 +16,7 @@ from rce_fleet.experiments.experiment import Experiment, Measured, Options, Tria
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.streaming import told
 from rce_fleet.experiments.systems.base import Flow, Layout, Workload, core_uri
+from rce_fleet.experiments.workloads.reach import TOLD_TO_END
 from rce_fleet.experiments.workloads.robot_base import CALLED, ENDED, MOVED, SCAN
 from rce_fleet.experiments.workloads.telling import reports
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 RUNS = 3
 """The same comes out each time, unless something goes wrong."""
-SECONDS = 12.0
+SECONDS = 8.0
 PATIENCE_S = 30.0
 POLL_S = 0.2
 COUNT = "count"
@@ -96,8 +97,8 @@ async def start(system: System) -> RunningWorkload:
 
 
 def is_ended(seen: list[dict[str, object]]) -> bool:
-    """Return whether robot 1's program saw nodes of robot 2, which it told to end."""
-    return any(report.get("nodes_others") for report in seen)
+    """Return whether robot 1's program told nodes of robot 2 to end."""
+    return any(report.get(TOLD_TO_END) for report in seen)
 
 
 async def deeds(base: RunningWorkload, patience: float) -> list[dict[str, object]]:
@@ -115,7 +116,12 @@ async def deeds(base: RunningWorkload, patience: float) -> list[dict[str, object
 
 def reached(seen: list[dict[str, object]], suffered: list[dict[str, object]]) -> list[Value]:
     """Return what robot 1's program saw and did, from what it and robot 2's told."""
-    counts = {name: value for report in seen for name, value in report.items() if isinstance(value, int)}
+    counts = {
+        name: value
+        for report in seen
+        for name, value in report.items()
+        if isinstance(value, int) and name != TOLD_TO_END
+    }
     found = [Value(name, float(value), COUNT) for name, value in counts.items()]
     happened = {name for report in suffered for name in report}
     return [*found, *(Value(name, float(deed in happened), COUNT) for name, deed in DEEDS.items())]

@@ -130,7 +130,8 @@ SECTIONS = (
     Section(
         "isolation",
         "What a robot sees of others",
-        "Counted from one robot: topics, nodes and parameters of another robot that it sees, and whether "
+        "Counted from one robot: topics, nodes and parameters of another robot that it sees, the most of two "
+        "looks 2 s apart, as what is shared may come late, and whether "
         "it can publish to it, call its service, end its nodes and call its core (1) or not (0). "
         "`files_to_add` and `lines_to_add` are what has to be written for one more robot.",
         (

@@ -1,7 +1,8 @@
 """What a program of one robot sees of another robot and can do to it: ``reach NUMBER CORE_URI``.
 
 The other robot's number, and the address of the core that its programs use. It looks, sends velocities to the
-other robot, calls its service, and at last tells its nodes to end, all by ordinary means of ROS.
+other robot, calls its service, looks again, as what is shared may come late, and at last tells the other
+robot's nodes to end, all by ordinary means of ROS.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ PERIOD_S = 0.2
 SECONDS = 2.0
 """How long it tries."""
 END = {"phase": "end"}
+TOLD_TO_END = "nodes_told_to_end"
 
 
 class Reach:
@@ -39,7 +41,11 @@ class Reach:
         self._core = core
         self._other = other
         self._name = f"/Robot{number}"
+        self._own = f"{self._name}/cmd_vel"
+        """The topic that it sends to."""
         self._output: Output | None = None
+        self._seen: dict[str, int] = {}
+        """The largest counts so far."""
         self._begin = 0.0
         self._is_told = False
 
@@ -48,8 +54,7 @@ class Reach:
         if not self._begin:
             self._begin = time.monotonic()
             self._look()
-            # Made after the look: this program's own topic would be seen too.
-            self._output = self._graph.output(f"{self._name}/cmd_vel", TWIST)
+            self._output = self._graph.output(self._own, TWIST)
         elif self._is_told or self._output is None:
             return PERIOD_S
         elif time.monotonic() - self._begin < SECONDS:
@@ -57,22 +62,25 @@ class Reach:
             self._graph.call(f"{self._name}/enable", TRIGGER, lambda _answer: None)
         else:
             self._is_told = True
-            for node in self._nodes():
+            self._look()
+            nodes = self._nodes()
+            tell({**self._seen, TOLD_TO_END: len(nodes)})
+            for node in nodes:
                 self._core.end_node(node)
             tell(END)
         return PERIOD_S
 
     def _look(self) -> None:
-        topics = self._core.published_topics()
-        tell(
-            {
-                "topics_visible": len(topics),
-                "topics_others": len(self._of_other(topics)),
-                "nodes_others": len(self._nodes()),
-                "parameters_others": len(self._of_other(self._core.parameters())),
-                "can_use_core": int(self._other.answers()),
-            }
-        )
+        # Its own topic is not the other robot's.
+        topics = [topic for topic in self._core.published_topics() if topic != self._own]
+        found = {
+            "topics_visible": len(topics),
+            "topics_others": len(self._of_other(topics)),
+            "nodes_others": len(self._nodes()),
+            "parameters_others": len(self._of_other(self._core.parameters())),
+            "can_use_core": int(self._other.answers()),
+        }
+        self._seen = {name: max(count, self._seen.get(name, 0)) for name, count in found.items()}
 
     def _nodes(self) -> list[str]:
         return self._of_other(self._core.nodes())

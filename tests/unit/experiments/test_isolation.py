@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain, repeat
 from threading import Thread
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCServer
@@ -51,13 +52,16 @@ class Graph:
 
 
 @contextmanager
-def core(slave: str = "") -> Iterator[tuple[str, list[str]]]:
+def core(slave: str = "", *, hidden: int = 0) -> Iterator[tuple[str, list[str]]]:
     """A core that is every node's slave API too; gives its URI, and who was told to end.
 
     Args:
         slave: URI of the slave API of all nodes, if it is another one.
+        hidden: How often its nodes are asked for before it has some.
     """
     told: list[str] = []
+    topics = ("/Robot2/scan", "/Robot20/scan", "/Robot2/cmd_vel")
+    states = chain(repeat([[], [], []], hidden), repeat(STATE))
 
     def look_up(_caller: str, name: str) -> str:
         told.append(name)
@@ -66,8 +70,8 @@ def core(slave: str = "") -> Iterator[tuple[str, list[str]]]:
     with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
         uri = f"http://127.0.0.1:{server.server_address[1]}/"
         answers: dict[str, Callable[..., object]] = {
-            "getPublishedTopics": lambda *_: [["/Robot2/scan", "a/B"], ["/Robot20/scan", "a/B"]],
-            "getSystemState": lambda *_: STATE,
+            "getPublishedTopics": lambda *_: [[name, "a/B"] for name in topics],
+            "getSystemState": lambda *_: next(states),
             "getParamNames": lambda *_: ["/Robot2/max_speed", "/rosversion"],
             "getPid": lambda *_: 1,
             "lookupNode": look_up,
@@ -83,12 +87,14 @@ def core(slave: str = "") -> Iterator[tuple[str, list[str]]]:
         thread.join()
 
 
+@pytest.mark.parametrize("hidden", [0, 1])
 def test_a_program_looks_tries_and_ends_the_others_nodes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    hidden: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """What is shared late is seen at the second look; the program's own topic never counts."""
     monkeypatch.setattr(module, "SECONDS", 0.2)
     graph = Graph()
-    with core() as (uri, told):
+    with core(hidden=hidden) as (uri, told):
         reach = Reach(graph, CoreApi("/reach", uri), CoreApi("/reach", "http://127.0.0.1:1/"), 2)
         reach.step()
         assert graph.asked == ["/Robot2/cmd_vel"]
@@ -105,7 +111,9 @@ def test_a_program_looks_tries_and_ends_the_others_nodes(
         "nodes_others": 1,
         "parameters_others": 1,
         "can_use_core": 0,
+        "nodes_told_to_end": 1,
     }
+    assert is_ended([seen])
     assert end == {"phase": "end"}
 
 
@@ -140,7 +148,8 @@ def test_a_base_tells_once_what_was_done_to_it(capsys: pytest.CaptureFixture[str
 
 
 def test_deeds_are_known_by_what_the_other_robot_tells() -> None:
-    found = reached([{"topics_others": 2}, {"phase": "end"}], [{"moved": True}])
+    seen: list[dict[str, object]] = [{"topics_others": 2, "nodes_told_to_end": 1}, {"phase": "end"}]
+    found = reached(seen, [{"moved": True}])
     assert {name: value for name, value, _ in found} == {
         "topics_others": 2.0,
         "can_publish": 1.0,
@@ -167,8 +176,8 @@ class Slow:
 
 
 async def test_the_end_of_a_node_is_waited_for_where_it_was_told_to() -> None:
-    assert is_ended([{"nodes_others": 1}, {"phase": "end"}])
-    assert not is_ended([{"nodes_others": 0}])
+    assert is_ended([{"nodes_told_to_end": 1}, {"phase": "end"}])
+    assert not is_ended([{"nodes_others": 1, "nodes_told_to_end": 0}])
     slow: Any = Slow()
     assert await deeds(slow, 0.0) == [{"moved": True}]
     assert await deeds(slow, 30.0) == [{"moved": True}, {"ended": True}]
