@@ -127,7 +127,9 @@ def reached(seen: list[dict[str, object]], suffered: list[dict[str, object]]) ->
     return [*found, *(Value(name, float(deed in happened), COUNT) for name, deed in DEEDS.items())]
 
 
-def to_add(files: Mapping[str, str]) -> list[Value]:
-    """Return how much has to be written for one more robot."""
+def to_add(files: Mapping[str, str] | None) -> list[Value]:
+    """Return how much has to be written for one more robot; nothing if that is not known (None)."""
+    if files is None:
+        return []
     lines = sum(len(text.splitlines()) for text in files.values())
     return [Value("files_to_add", float(len(files)), COUNT), Value("lines_to_add", float(lines), COUNT)]

@@ -129,7 +129,7 @@ class System(ABC):
     title: ClassVar[str]
     """The paper's short name."""
     core_machine: ClassVar[str] = SERVER
-    """The machine whose core is killed in the experiment ``robustness``."""
+    """The machine whose core, started by :meth:`start_core`, is killed in the experiment ``robustness``."""
     has_master: ClassVar[bool] = False
     """Whether there is something beside the cores that connects the machines, and can be killed."""
     has_containers: ClassVar[bool] = False
@@ -177,9 +177,13 @@ class System(ABC):
         """
 
     @classmethod
-    def wiring(cls, robot: int) -> dict[str, str]:
-        """Return the files that have to be written for one more robot with a scan: name and text."""
-        raise ExperimentError(f"{cls.title}: what robot {robot} needs is not known")
+    def wiring(cls, robot: int) -> dict[str, str] | None:
+        """Return the files that have to be written for one more robot with a scan: name and text.
+
+        None: that is not known.
+        """
+        del robot
+        return None
 
     async def start_core(self, machine: str) -> Program:
         """Start a ROS core on a machine."""
@@ -195,7 +199,16 @@ class System(ABC):
         return self._cores[machine]
 
     async def kill_core(self) -> None:
-        """Kill the core of the machine ``core_machine``."""
+        """Kill the core of the machine ``core_machine``.
+
+        Raises:
+            ExperimentError: It has none.
+        """
+        if self.core_machine not in self._cores:
+            raise ExperimentError(
+                f"{self.title}: no core was started on {self.core_machine}; name a machine that has one as "
+                f"{type(self).__name__}.core_machine ({', '.join(self._cores) or 'none has one'})"
+            )
         await self.bench.kill(self._cores[self.core_machine])
 
     async def restart_core(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,7 +14,8 @@ from rce_client.ros_bridge.robot_file import RobotFile
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS
-from rce_fleet.experiments.systems.base import Flow, Layout
+from rce_fleet.experiments.isolation import to_add
+from rce_fleet.experiments.systems.base import Flow, Layout, RunningWorkload, System, Workload
 from rce_fleet.experiments.systems.cloud import Cloud
 from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import RCE, software_of
@@ -48,6 +50,54 @@ def test_the_papers_systems_are_there() -> None:
         files = system_of(name).wiring(7)
         assert files
         assert all("7" in file for file in files)
+
+
+class RobotMaster(System):
+    """One core, on the robots' machine; as docs/how-to/add-a-system.md has it."""
+
+    name = "robot_master"
+    title = "RMS"
+
+    async def connect(self, flows: Sequence[Flow]) -> None:
+        del flows
+        await self.start_core(CLIENT)
+
+    async def run(self, workload: Workload) -> RunningWorkload:
+        return await self.run_in_graph(workload, CLIENT)
+
+
+class Machines:
+    """A bench on which programs start at once; notes which were killed."""
+
+    def __init__(self) -> None:
+        self.killed: list[object] = []
+
+    def address(self, machine: str) -> str:
+        return f"{machine}.local"
+
+    async def start(self, machine: str, *_: object, **__: object) -> str:
+        return f"core of {machine}"
+
+    async def kill(self, program: object) -> None:
+        self.killed.append(program)
+
+
+async def test_a_core_is_killed_where_one_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    machines = Machines()
+    system = RobotMaster(cast("Bench", machines), RCE, Layout())
+    await system.connect([])
+    with pytest.raises(
+        ExperimentError, match=r"RMS: no core was started on server; .*core_machine \(client\)"
+    ):
+        await system.kill_core()
+    monkeypatch.setattr(RobotMaster, "core_machine", CLIENT)
+    await system.kill_core()
+    assert machines.killed == ["core of client"]
+
+
+def test_what_a_robot_needs_may_be_unknown() -> None:
+    """Isolation leaves its counts out then, after all else was measured."""
+    assert to_add(RobotMaster.wiring(2)) == []
 
 
 def test_what_is_not_there_is_named() -> None:
