@@ -174,6 +174,8 @@ def demo(
         fleet = _choose_fleet(count, full_stack, floor, seed, scen, ways)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
         _check_duration(duration, timeout, mode, headless=headless)
+        if duration is not None and replicas == 1:  # else masters are killed, not the planner
+            _check_kills(duration, count)
         if report is not None and headless:
             _check_report(report)
         if timeout is None:
@@ -276,6 +278,18 @@ def _check_duration(duration: float | None, timeout: float | None, mode: Mode, *
         raise DemoError("--duration is for headless runs: add --headless")
     if duration is not None and mode is not Mode.CLOUD:
         raise DemoError(f"--duration kills the planner's container: use --mode cloud, not --mode {mode}")
+
+
+def _check_kills(duration: float, robots: int) -> None:
+    """Raise DemoError if the planner cannot be killed as often as it must be while tasks are streamed."""
+    from rce_fleet.demo.task_run import KILLS, shortest_run  # a demo with a page starts sooner without it
+
+    least = shortest_run(robots)
+    if duration < least:
+        raise DemoError(
+            f"--duration {duration:g} is too short to kill the planner {KILLS} times with {robots} robots: "
+            f"give at least {least:g} s"
+        )
 
 
 def _check_replicas(replicas: int, mode: Mode) -> None:

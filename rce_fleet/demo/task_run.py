@@ -35,6 +35,16 @@ LAST_TASKS = 60.0
 """Seconds after the stream's end in which open tasks may still be done."""
 
 
+def poll_s(robots: int) -> float:
+    """Return the seconds between two requests for the state of so many robots."""
+    return max(POLL_S, robots / ROBOTS_PER_POLL_S)
+
+
+def shortest_run(robots: int) -> float:
+    """Return how long a run with so many robots must be, seconds, in which the planner is killed."""
+    return (KILLS + 1) * poll_s(robots)
+
+
 class TaskRun:
     """Streams tasks for some time.
 
@@ -77,7 +87,7 @@ class TaskRun:
         self._truth = truth
         self._kill_planner = kill_planner
         self._say = say
-        self._poll = max(POLL_S, robots / ROBOTS_PER_POLL_S)
+        self._poll = poll_s(robots)
         self._began: tuple[float, float] | None = None
         self._streamed = 0.0
         self._simulated = 0.0

@@ -61,6 +61,10 @@ async def test_a_demo_without_a_standard_input_has_no_key(monkeypatch: pytest.Mo
         (("--report", "."), "is a folder"),
         (("--duration", "60", "--timeout", "60"), "--timeout 60 ends the run before its --duration of 60 s"),
         (("--duration", "60", "--mode", "single"), "use --mode cloud"),
+        (
+            ("--duration", "2"),
+            "--duration 2 is too short to kill the planner 2 times with 3 robots: give at least 3 s",
+        ),
         (("--state-dir", "/dev/null/state"), "--state-dir /dev/null/state cannot be used: Not a directory"),
     ],
 )
