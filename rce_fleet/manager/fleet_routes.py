@@ -66,7 +66,7 @@ async def change_robot(call: Call) -> FleetAnswer:
     if profile != entry.profile:
         changed = replace(entry, profile=profile, revision=entry.revision + 1)
         call.manager.book.emit(changed, "profile", call.now, user=call.request.user, text=f"{name}: profile")
-        await call.manager.commit()
+    await call.manager.commit()  # also if another request just set it: that may not be in the journal yet
     return _robot_answer(call, name)
 
 
@@ -133,24 +133,29 @@ def _entry(call: Call) -> tuple[str, RobotEntry]:
 
 async def _set_mode(call: Call, mode: str, what: str, *, unless_out: bool = False) -> FleetAnswer:
     """Set who drives a robot; if the planner refuses, its mode stays."""
-    (name, entry), manager = _entry(call), call.manager
-    if unless_out and entry.is_out:
-        raise TaskRefusedError(f"{name} is out of service: put it in")
-    reason = call.model(HoldRequest).reason if mode != AUTOMATIC else ""
-    user = call.request.user
-    changed = replace(entry, mode=mode, reason=reason, user=user, revision=entry.revision + 1, unsent=True)
-    if (entry.mode, entry.reason) != (mode, reason):
-        text = f"{name}: {what}" + (f", {reason}" if reason else "")
-        manager.book.emit(changed, what, call.now, user=user, text=text)
-        await manager.commit()
-        refusals = await manager.tell_planner()
-        refusal = next(
-            (why for made, why in refusals.items() if made == SetMode(name, mode, reason, user)), ""
+    manager, user = call.manager, call.request.user
+    async with manager.changes.hold("mode", _robot(call)):
+        name, entry = _entry(call)
+        if unless_out and entry.is_out:
+            raise TaskRefusedError(f"{name} is out of service: put it in")
+        reason = call.model(HoldRequest).reason if mode != AUTOMATIC else ""
+        if (entry.mode, entry.reason) == (mode, reason):
+            await manager.commit()  # it may not be in the journal yet
+            return _robot_answer(call, name)
+        changed = replace(
+            entry, mode=mode, reason=reason, user=user, revision=entry.revision + 1, unsent=True
         )
-        if refusal and manager.facts.is_live and manager.book.entry(name) == changed:
-            back = replace(entry, revision=changed.revision + 1)
-            manager.book.emit(back, entry.mode, manager.clock(), text=f"{name}: {refusal}")
-            await manager.commit()
+        text = f"{name}: {what}" + (f", {reason}" if reason else "")
+        manager.book.emit(changed, what, manager.clock(), user=user, text=text)
+        await manager.commit()
+        robot = manager.facts.robots.get(name)
+        is_known = robot is not None and robot.is_known
+        refusal = await manager.tell(SetMode(name, mode, reason, user)) if is_known else ""
+        if refusal and not refusal.startswith(NO_ANSWER):
+            if manager.book.entry(name) == changed:
+                back = replace(entry, revision=changed.revision + 1)
+                manager.book.emit(back, entry.mode, manager.clock(), text=f"{name}: {refusal}")
+                await manager.commit()
             raise TaskRefusedError(refusal)
     return _robot_answer(call, name)
 

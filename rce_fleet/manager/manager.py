@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import EventQuery, event_fields
+from rce_fleet.manager.change_locks import ChangeLocks
 from rce_fleet.manager.clock import WallClock
 from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.hand_goals import HandGoals
 from rce_fleet.manager.planner_link import carry_out
-from rce_fleet.manager.planner_sync import FLEET, BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.planner_sync import FLEET, PlannerCall, PlannerSync, SetMode, SetZone
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.clamping import clamped
@@ -64,6 +65,7 @@ class FleetManager:
         facts: What is known of the robots.
         goals: The goals that were sent.
         hand_goals: The goals that people set.
+        changes: Lets requests that change the same thing at the planner follow each other.
         written: Number of the last event that is in the journal.
     """
 
@@ -96,6 +98,7 @@ class FleetManager:
         """Whether the book may have what the journal has not, because that could not be read."""
         self.facts = FleetFacts()
         self.goals = GoalKeeper()
+        self.changes = ChangeLocks(lambda: self._failure)
         self._load()
         self._sync = PlannerSync(self.book, self.facts)
         self.hand_goals = HandGoals(self.book, self.facts, self.goals)
@@ -218,24 +221,25 @@ class FleetManager:
         if remark:
             self._log.warning("%s", remark)
 
-    async def tell_planner(self) -> dict[PlannerCall, str]:
-        """Send modes, zones and blocked cells that the planner does not have yet.
-
-        Returns:
-            Why the planner refused some of them.
-        """
-        refusals = {}
+    async def tell_planner(self) -> None:
+        """Send modes, zones and blocked cells that the planner does not have yet."""
         for call in self._sync.calls(self.clock()):
             if not self.facts.is_live:
                 break
             refusal = await self._tell(call)
             if refusal:
-                refusals[call] = refusal
                 self._log.warning("the planner refused %s: %s", call, refusal)
                 if isinstance(call, SetZone) and call.zone and not refusal.startswith(NO_ANSWER):
                     before = self.facts.zones.get(call.id)
                     self._sync.undo_zone(call.zone, before, self.clock(), refusal)
-        return refusals
+
+    async def tell(self, call: PlannerCall) -> str:
+        """Send what a request changed, which is in the journal, to the planner at once.
+
+        Returns:
+            Why the planner refused; empty: it did not, or gets the change when it is heard again.
+        """
+        return await self._tell(call) if self.facts.is_live else ""
 
     async def set_zone(self, zone: Zone, before: Zone | None) -> str:
         """Send a zone of a request, which is in the journal, to the planner at once.
@@ -251,25 +255,12 @@ class FleetManager:
         Raises:
             JournalError: The journal cannot be written.
         """
-        refusal = await self._tell(SetZone(zone.id, zone)) if self.facts.is_live else ""
+        refusal = await self.tell(SetZone(zone.id, zone))
         if not refusal or refusal.startswith(NO_ANSWER):
             return ""
         if self._sync.undo_zone(zone, before, self.clock(), refusal):
             await self.commit()
         return refusal
-
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        """Send a request to block or free a cell, which is in the journal, to the planner at once.
-
-        A cell that only sensors found blocked is freed as well, though the journal does not have it.
-
-        Returns:
-            Why the planner refused; empty: it did not, or gets the request when it is heard again.
-        """
-        if not self.facts.is_live:
-            return ""
-        call = BlockCell(cell, blocked)
-        return await self._tell(call)
 
     async def set_fleet_mode(self, mode: str, reason: str, user: str) -> str:
         """Keep the fleet's mode in the journal, then send it to the planner at once.
@@ -286,20 +277,19 @@ class FleetManager:
         Raises:
             JournalError: The journal cannot be written.
         """
-        book, before = self.book, self.book.fleet
-        changed = FleetEntry(mode, reason, user, before.revision + 1, unsent=True)
-        text = f"the fleet is {mode}" + (f": {reason}" if reason else "")
-        book.emit(changed, mode, self.clock(), user=user, text=text)
-        await self.commit()
-        if not self.facts.is_live:
-            return ""
-        call = SetMode(FLEET, mode, reason, user)
-        refusal = await self._tell(call)
-        if refusal and self.book.fleet == changed:
-            back = replace(before, revision=changed.revision + 1)
-            self.book.emit(back, "refused", self.clock(), text=f"the fleet stays {before.mode}: {refusal}")
+        async with self.changes.hold("mode"):
+            before = self.book.fleet
+            changed = FleetEntry(mode, reason, user, before.revision + 1, unsent=True)
+            text = f"the fleet is {mode}" + (f": {reason}" if reason else "")
+            self.book.emit(changed, mode, self.clock(), user=user, text=text)
             await self.commit()
-        return refusal
+            refusal = await self.tell(SetMode(FLEET, mode, reason, user))
+            if refusal and self.book.fleet == changed:
+                back = replace(before, revision=changed.revision + 1)
+                text = f"the fleet stays {before.mode}: {refusal}"
+                self.book.emit(back, "refused", self.clock(), text=text)
+                await self.commit()
+            return refusal
 
     async def set_goal(self, robot: str, cell: int | None, user: str) -> str:
         """Keep a robot's goal in the journal, then send it to the planner.
@@ -317,17 +307,18 @@ class FleetManager:
             TaskRefusedError: The robot cannot have a goal of a person now.
             JournalError: The journal cannot be written.
         """
-        before = self.book.goals.get(robot)
-        entry = self.hand_goals.request(robot, cell, self.clock(), user)
-        with self.hand_goals.asking(entry, self.clock()):
+        async with self.changes.hold("goal", robot):
+            before = self.book.goals.get(robot)
+            entry = self.hand_goals.request(robot, cell, self.clock(), user)
+            with self.hand_goals.asking(entry, self.clock()):
+                await self.commit()
+                if not self.facts.is_live:
+                    return ""
+                refusal = await self._planner.set_goal(robot, cell)
+                if not refusal or not self.hand_goals.undo(entry, before, self.clock(), refusal):
+                    return refusal
             await self.commit()
-            if not self.facts.is_live:
-                return ""
-            refusal = await self._planner.set_goal(robot, cell)
-            if not refusal or not self.hand_goals.undo(entry, before, self.clock(), refusal):
-                return refusal
-        await self.commit()
-        return refusal
+            return refusal
 
     async def _note_confirmed(self) -> None:
         """Keep in the journal what the planner confirmed: it is not sent again after a restart."""

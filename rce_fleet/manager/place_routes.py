@@ -17,6 +17,7 @@ from rce_fleet.api.fleet import (
 from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
 from rce_fleet.limits import MOST_CELL
 from rce_fleet.manager.goals import NO_ANSWER
+from rce_fleet.manager.planner_sync import BlockCell
 from rce_fleet.manager.requests import Call, FleetAnswer, Route, problem, shown
 from rce_fleet.manager.zones import checked
 from rce_fleet.tasks.records import Places, Zone
@@ -92,8 +93,13 @@ async def zone(call: Call) -> FleetAnswer:
 
 async def set_zone(call: Call) -> FleetAnswer:
     """Make or replace a zone; if the planner refuses, the zones stay as they were."""
+    async with call.manager.changes.hold("zone", call.names[0]):
+        return await _set_zone(call)
+
+
+async def _set_zone(call: Call) -> FleetAnswer:
     model, name = call.model(ZoneRequest), call.names[0]
-    book = call.manager.book
+    book, now = call.manager.book, call.manager.clock()
     known = book.zones.get(name)
     call.check_revision(f"zone {name}", known.revision if known else 0)
     asked = Zone(
@@ -109,8 +115,8 @@ async def set_zone(call: Call) -> FleetAnswer:
         book.next_revision(known),
         unsent=True,
     )
-    made = checked(asked, book.grid, call.now)
-    book.emit(made, "zone", call.now, user=call.request.user, text=f"zone {name}: {model.kind}")
+    made = checked(asked, book.grid, now)
+    book.emit(made, "zone", now, user=call.request.user, text=f"zone {name}: {model.kind}")
     await call.manager.commit()
     if refusal := await call.manager.set_zone(made, known):
         raise TaskRefusedError(refusal)
@@ -132,21 +138,27 @@ async def remove_zone(call: Call) -> FleetAnswer:
 
 async def set_cell(call: Call) -> FleetAnswer:
     """Block or free a cell; if the planner refuses, it stays as it was."""
-    name, blocked, manager = call.names[0], call.model(CellChange).blocked, call.manager
+    name, blocked = call.names[0], call.model(CellChange).blocked
     if not (name.isdecimal() and name.isascii() and len(name) <= MOST_DIGITS):
         return problem(404, f"{name[:MOST_DIGITS]!r} is not the number of a cell")
-    cell, user = int(name), call.request.user
+    cell = int(name)
     if cell > MOST_CELL:
         return problem(404, f"cells have numbers up to {MOST_CELL}, not {cell}")
     check_cells(call, (cell,))
+    async with call.manager.changes.hold("cell", str(cell)):
+        return await _set_cell(call, cell, blocked=blocked)
+
+
+async def _set_cell(call: Call, cell: int, *, blocked: bool) -> FleetAnswer:
+    manager = call.manager
     was_blocked = cell in manager.book.blocked.cells
     made = manager.book.blocked.changed({cell: blocked}, unsent=True)
     what, text = ("blocked", f"cell {cell} is blocked") if blocked else ("freed", f"cell {cell} is free")
     if was_blocked != blocked:
-        manager.book.emit(made, what, call.now, user=user, text=text)
-        await manager.commit()
-    refusal = await manager.block_cell(cell, blocked=blocked)
-    if refusal:
+        manager.book.emit(made, what, manager.clock(), user=call.request.user, text=text)
+    await manager.commit()  # also if it is so already: that may not be in the journal yet
+    # A cell that only sensors found blocked is freed as well, though the journal does not have it.
+    if refusal := await manager.tell(BlockCell(cell, blocked)):
         if was_blocked != blocked and (cell in manager.book.blocked.cells) == blocked:
             back = manager.book.blocked.changed({cell: was_blocked}, unsent=False)
             manager.book.emit(back, "refused", manager.clock(), text=f"cell {cell}: {refusal}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -238,6 +239,28 @@ async def test_a_refused_goal_leaves_everything_as_it_was(fleet: Fleet) -> None:
     fleet.planner.refusal = f"{NO_ANSWER}: closed"
     assert (await fleet.manager.set_goal("Robot2", 20, "anna")).startswith(NO_ANSWER)
     assert fleet.manager.book.goals == {}
+
+
+async def test_two_refused_goals_leave_the_one_before(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one came before the planner had answered the first one."""
+    assert await fleet.manager.set_goal("Robot1", 20, "anna") == ""
+    before = fleet.manager.book.goals["Robot1"]
+    asked, answered = asyncio.Event(), asyncio.Event()
+
+    async def refuse(_robot: str, _cell: int | None) -> str:
+        asked.set()
+        await answered.wait()
+        return f"{NO_ANSWER}: closed"
+
+    monkeypatch.setattr(fleet.planner, "set_goal", refuse)
+    async with asyncio.timeout(60):
+        first = asyncio.create_task(fleet.manager.set_goal("Robot1", 30, "anna"))
+        await asked.wait()
+        second = asyncio.create_task(fleet.manager.set_goal("Robot1", 40, "bob"))
+        await asyncio.sleep(0)
+        answered.set()
+        assert [await each for each in (first, second)] == [f"{NO_ANSWER}: closed"] * 2
+    assert fleet.manager.book.goals["Robot1"] == before
 
 
 async def test_a_robot_that_is_taken_out_loses_its_goal(fleet: Fleet) -> None:

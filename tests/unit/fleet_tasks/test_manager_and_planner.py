@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from support.fleet_manager import GO, ManagerClient
 
 from rce.ros.types import Time
 from rce_fleet.coordination.planner import FleetPlanner
-from rce_fleet.manager.goals import GoalKeeper
+from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.mirror import REFUSED_S
 from rce_fleet.nodes.fleet_facts import FULL, FactKeeper
 from rce_fleet.nodes.state_publisher import state_fields
@@ -198,6 +199,71 @@ async def test_a_mode_that_the_planner_refuses_stays(client: ManagerClient) -> N
     status, body, _ = await client.ask("POST", "/robots/Robot1/take-out")
     assert (status, body["error"]) == (409, "not now")
     assert (await client.ask("GET", "/robots/Robot1"))[1]["mode"] == "automatic"
+
+
+@pytest.mark.parametrize("change", ["pause", "take-out"])
+async def test_a_mode_without_an_answer_is_sent_later(client: ManagerClient, change: str) -> None:
+    """The planner is being restarted: it gets what was accepted, as if it had not been heard before."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    planner.refusal = f"{NO_ANSWER}: closed"
+    status, body, _ = await client.ask("POST", f"/robots/Robot1/{change}")
+    assert (status, body["mode"]) == (200, planner.calls[0][2])
+    planner.refusal = ""
+    manager.planner_began(PlannerRun("2", "8 x 8"))
+    await manager.step()
+    assert planner.calls == [planner.calls[0]] * 2
+    assert manager.book.entry("Robot1").mode == body["mode"]
+
+
+async def test_a_robot_paused_with_the_fleet_stays_paused(client: ManagerClient) -> None:
+    """The planner has to know the robot's own mode when the fleet drives again."""
+    manager = client.manager
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    manager.facts.robots["Robot1"] = RobotFacts("Robot1", "paused", cell=0, mode="paused")
+    manager.facts.mode = "paused"
+    await manager.step()
+    assert (await client.ask("POST", "/robots/Robot1/pause"))[0] == 200
+    assert client.planner.calls == [("mode", "Robot1", "paused", "", "erp")]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "bodies"),
+    [
+        ("PUT", "/mode", ({"mode": "paused"}, {"mode": "paused", "reason": "lunch"})),
+        ("POST", "/robots/Robot1/pause", ({}, {"reason": "lunch"})),
+        ("PUT", "/cells/12", ({"blocked": True}, {"blocked": False})),
+        ("PUT", "/zones/z", ({"kind": "blocked", "cells": [3]}, {"kind": "blocked", "cells": [4]})),
+    ],
+)
+async def test_two_refused_requests_leave_what_was_before(
+    client: ManagerClient, method: str, path: str, bodies: tuple[Any, Any]
+) -> None:
+    """The second one came before the planner had answered the first one."""
+    manager, planner, asked, answered = client.manager, client.planner, asyncio.Event(), asyncio.Event()
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+
+    async def refuse(*_given: object, **_named: object) -> str:
+        asked.set()
+        await answered.wait()
+        return "not now"
+
+    planner.set_mode = planner.block_cell = planner.set_zone = refuse  # type: ignore[method-assign]
+    async with asyncio.timeout(60):
+        first = asyncio.create_task(client.ask(method, path, bodies[0]))
+        await asked.wait()
+        second = asyncio.create_task(client.ask(method, path, bodies[1]))
+        await asyncio.sleep(0)
+        answered.set()
+        assert [(await each)[0] for each in (first, second)] == [409, 409]
+    book = manager.book
+    assert (book.fleet.mode, book.entry("Robot1").mode) == ("automatic", "automatic")
+    assert (book.blocked.cells, book.zones) == ((), {})
 
 
 async def test_a_goal_set_by_hand_holds_the_task(client: ManagerClient) -> None:

@@ -121,6 +121,37 @@ async def test_old_events_that_cannot_be_removed_stop_nothing(
     assert (client.manager.failure, len(client.manager.book.tasks)) == ("", 3)
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("PATCH", "/robots/Robot1", {"profile": {"payload": 7.0}}),
+        ("POST", "/robots/Robot1/pause", {}),
+        ("PUT", "/cells/12", {"blocked": True}),
+    ],
+)
+async def test_a_repeated_request_waits_for_the_journal_too(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch, method: str, path: str, body: object
+) -> None:
+    """It was answered before the first one was written, which then failed."""
+    begun, go_on = threading.Event(), threading.Event()
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+
+    def append(*_given: object) -> None:
+        begun.set()
+        go_on.wait(60)
+        raise JournalError("the disk is full")
+
+    monkeypatch.setattr(client.journal, "append", append)
+    async with asyncio.timeout(60):
+        first = asyncio.create_task(client.ask(method, path, body))
+        await asyncio.to_thread(begun.wait, 60)
+        second = asyncio.create_task(client.ask(method, path, body))
+        await asyncio.sleep(0)
+        go_on.set()
+        assert [(await each)[0] for each in (first, second)] == [507, 507]
+    assert (client.manager.book.number, client.planner.calls) == (0, [])
+
+
 async def test_an_event_that_cannot_be_written_is_rolled_back(client: ManagerClient) -> None:
     """A record without a form in the journal: waiting callers are told, and the next step recovers."""
     assert (await client.ask("POST", "/tasks", GO))[0] == 201
