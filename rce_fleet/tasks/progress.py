@@ -291,6 +291,11 @@ class TaskProgress:
         if ended.state is TaskState.HELD and not ended.is_loaded:
             ended = replace(ended, robot="", revision=ended.revision + 1)
             self._book.emit(ended, "left", now, text=f"{visit.robot} is free; {task.id} stays held")
+        elif ended.state is TaskState.SUSPENDED and ended.question:
+            self._asked[task.number] = ended.position
+            reason = ended.reason.replace(_bond(task), _bond(ended), 1)
+            ended = replace(ended, reason=reason, revision=ended.revision + 1)
+            self._book.emit(ended, "question", now, text=ended.question)
         return ended
 
     def _is_over(
@@ -370,7 +375,7 @@ class TaskProgress:
             else:
                 self._book.advance(task, TaskCause.RELEASE, now, reason, robot="", target=None)
             return
-        what = f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
+        what = _bond(task)
         if task.state is TaskState.RUNNING:
             self._suspend(task, now, f"{what}: {reason}", is_away=is_away)
         elif self._elapsed(task.changed_at, now) > self._rules.load_lost_after:
@@ -392,6 +397,11 @@ class TaskProgress:
         if suspended.question and (is_away or self._asked.get(task.number) != task.position):
             self._asked[task.number] = task.position
             self._book.emit(suspended, "question", now, text=suspended.question)
+
+
+def _bond(task: Task) -> str:
+    """Return why only its present robot can continue a task, in words."""
+    return f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
 
 
 def _stop_of_visit(task: Task, visit: StopVisit) -> Stop:

@@ -215,6 +215,30 @@ def test_a_cancelled_pick_of_a_silent_robot_takes_its_time(floor: Floor, state: 
     assert (floor.task(task).action, floor.task(task).loads) == (None, 1)
 
 
+@pytest.mark.parametrize("mode", ["automatic", "out_of_service"])
+def test_people_are_asked_for_a_load_taken_meanwhile(floor: Floor, mode: str) -> None:
+    """The robot became silent, or was taken out, while it took the load."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(2, 20, 60.0)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    if mode == "automatic":
+        robot.state, robot.reason, robot.away_since = "silent", "no messages", floor.now
+    else:
+        floor.book.emit(RobotEntry("Robot1", mode=mode), "taken out", floor.now)
+    floor.run(30)
+    suspended = floor.task(task)
+    assert (suspended.state, suspended.question) == (TaskState.SUSPENDED, "")
+    assert suspended.reason.startswith("Robot1 acts for it: Robot1 ")
+    floor.run(60)
+    asked = floor.task(task)
+    assert "Where is the load that Robot1 has?" in asked.question
+    assert asked.reason == suspended.reason.replace("Robot1 acts for it", "its load is on Robot1")
+    (question,) = [event for event in floor.events if event.name == "question"]
+    assert question.text == asked.question
+    assert settle_load(floor.book, task.id, 5, floor.now).state is TaskState.QUEUED
+
+
 def strand(floor: Floor, *, is_dead: bool, cancel_first: bool) -> Task:
     """Let a robot vanish with the load of a task that is cancelled, before or after that."""
     robot = floor.add("Robot1", 0)
