@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import KeyReusedError, TaskRefusedError, UnknownTaskError
 from rce_fleet.limits import MOST_TIME
+from rce_fleet.tasks.loads import without_takeovers
 from rce_fleet.tasks.order import check_cells, check_order
 from rce_fleet.tasks.tables import FleetTables
 from rce_fleet.tasks.task import TASK_LIFE, Task, TaskCause, TaskState
@@ -325,12 +326,15 @@ def _recurs_at(task: Task, order: Order, now: float) -> float | None:
 
 
 def _order_at(task: Task, order: Order, due: float) -> Order:
-    """Return an order for a task's next occurrence: a deadline that was not changed moves with its start."""
-    deadline = order.deadline
+    """Return an order for a task's next occurrence, without stops that took over the load of this one.
+
+    A deadline that was not changed moves with its start.
+    """
+    due, deadline = min(due, MOST_TIME), order.deadline
     if deadline is not None and deadline == task.order.deadline:
         shift = due - (task.order.earliest_start or task.created_at)
         deadline = min(deadline + shift, MOST_TIME)
-    return replace(order, earliest_start=due, deadline=deadline)
+    return replace(without_takeovers(order), earliest_start=due, deadline=deadline)
 
 
 def digest(order: Order) -> str:

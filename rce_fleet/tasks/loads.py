@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
 
 _WITH_LOAD = frozenset({TaskState.SUSPENDED, TaskState.HELD, TaskState.CANCELLING})
+_TAKEOVER = "takes the load over"
+"""Label of the stops where another robot picks up the load of one that does not come back."""
 
 
 def settle_load(
@@ -93,8 +95,19 @@ def with_picks(task: Task, cell: int) -> Order:
         )
     picks = [stop for stop in order.stops[: task.position] if stop.action is Action.PICK]
     duration = max((stop.duration for stop in picks), default=0.0)
-    added = (Stop(Action.PICK, (cell,), duration, label="takes the load over"),) * task.loads
+    added = (Stop(Action.PICK, (cell,), duration, label=_TAKEOVER),) * task.loads
     return replace(order, stops=(*order.stops[: task.position], *added, *order.stops[task.position :]))
+
+
+def without_takeovers(order: Order) -> Order:
+    """Return an order without the stops of :func:`with_picks`: they are for one load, not for each one."""
+    stops = tuple(stop for stop in order.stops if stop.action is not Action.PICK or stop.label != _TAKEOVER)
+    own = replace(order, stops=stops)
+    try:
+        check_order(own)
+    except TaskRefusedError:
+        return order  # a person gave this label to a stop that is needed
+    return own
 
 
 def _end(book: TaskBook, task: Task, cause: TaskCause, now: float, user: str, text: str) -> Task:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from support.fleet_manager import GO, ManagerClient
 
+from rce_fleet.limits import MOST_TIME
 from rce_fleet.manager import manager as managers
 from rce_fleet.tasks.task import Task, TaskState
 
@@ -70,6 +71,16 @@ async def test_a_change_between_occurrences_counts_for_the_next(
     assert following["earliest_start"] == body["recurs_at"]
     for name, value in shifted(expected).items():
         assert following[name] == pytest.approx(value, abs=1e-3)
+
+
+async def test_an_occurrence_beyond_the_latest_time_is_shown(client: ManagerClient) -> None:
+    """Its start was later than what an answer may have: the list of all tasks failed."""
+    await _between_occurrences(client, earliest_start=MOST_TIME)
+    status, body, _ = await client.ask("PATCH", "/tasks/T1", {"priority": 3})
+    assert (status, body["earliest_start"]) == (200, MOST_TIME)
+    client.manager.book.recur(client.manager.book.tasks[1], client.manager.clock())
+    listed = (await client.ask("GET", "/tasks"))[1]["tasks"]
+    assert [task["earliest_start"] for task in listed] == [MOST_TIME, MOST_TIME]
 
 
 @pytest.mark.parametrize("change", [{"repeat": None}, {"repeat": {"every": 3600, "count": 1}}])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import pytest
@@ -65,6 +66,33 @@ def test_people_are_asked_where_a_vanished_load_is(floor: Floor) -> None:
     assert [(visit.robot, visit.cell) for visit in ended.visits] == [
         *(("Robot1", 3), ("Robot2", 20), ("Robot2", 60)),
     ]
+
+
+def test_an_occurrence_takes_no_former_load_over(floor: Floor) -> None:
+    """The next occurrence would wait in vain at the place where the load of this one was found."""
+    robot = floor.add("Robot1", 0)
+    first = floor.deliver(3, 60, every=3600.0)
+    while not floor.task(first).is_loaded:
+        floor.run(1)
+    robot.state, robot.away_since = "silent", floor.now
+    floor.run(20)
+    settle_load(floor.book, first.id, 20, floor.now)
+    floor.add("Robot2", 63)
+    floor.run_until_ended(first)
+    assert [visit.cell for visit in floor.task(first).visits] == [3, 20, 60]
+    following = floor.book.recur(floor.task(first), floor.now)
+    assert following.order.stops == first.order.stops
+    changed = floor.book.change(
+        following.id, replace(following.order, stops=floor.task(first).order.stops), floor.now
+    )
+    assert floor.book.recur(changed, floor.now).order.stops == first.order.stops
+
+
+def test_an_occurrence_keeps_a_pick_with_any_label(floor: Floor) -> None:
+    """A person gave it the label of the stops that take a load over."""
+    stops = (Stop(Action.PICK, (3,), label="takes the load over"), Stop(Action.DELIVER, (60,)))
+    task = floor.book.create(Order(stops, every=3600.0), floor.now)
+    assert floor.book.recur(task, floor.now).order.stops == stops
 
 
 def test_a_lost_load_fails_its_task(floor: Floor) -> None:
