@@ -94,10 +94,10 @@ class TaskBook(FleetTables):
         if task.has_ended or task.state is TaskState.CANCELLING:
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be changed any more")
         check_order(order)
-        if self.grid is not None:
-            check_cells(order, self.grid)
-        self._check_after(order, task)
         made = task.position + (task.action is not None)
+        if self.grid is not None:
+            check_cells(order, self.grid, made)
+        self._check_after(order, task)
         if order.length < made or any(order.stop(n) != task.order.stop(n) for n in range(made)):
             raise TaskRefusedError(
                 f"the first {made} stops of {task.id} were made or begun: they must stay as they are"

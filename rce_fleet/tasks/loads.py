@@ -53,7 +53,7 @@ def settle_load(
     order = with_picks(task, cell)
     check_order(order)
     if book.grid is not None:
-        check_cells(order, book.grid)
+        check_cells(order, book.grid, task.position)
     changed = replace(free, order=order, loads=0)
     if task.state is TaskState.SUSPENDED:
         return _end(book, changed, TaskCause.RELEASE, now, user, where)

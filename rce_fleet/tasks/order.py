@@ -113,9 +113,14 @@ class Order:
         """Return a stop, counted from 0 over all rounds."""
         return self.stops[number % len(self.stops)]
 
-    def cells(self) -> Iterator[int]:
-        """Return all cells that the order names."""
-        for stop in self.stops:
+    def cells(self, made: int = 0) -> Iterator[int]:
+        """Return the cells that the order names.
+
+        Args:
+            made: Number of stops, all rounds counted, that do not come again.
+        """
+        left = self.length - made
+        for stop in self.stops[max(0, len(self.stops) - left) :]:
             yield from stop.cells
         yield from self.return_cells
 
@@ -166,13 +171,18 @@ def _problems_of_stops(order: Order) -> Iterator[str]:
         yield "a task with rounds must deliver in each round what it picks"
 
 
-def check_cells(order: Order, grid: GridMap) -> None:
+def check_cells(order: Order, grid: GridMap, made: int = 0) -> None:
     """Check that the cells of an order are on the map, and not in its walls.
+
+    Args:
+        order: The order.
+        grid: The map.
+        made: Number of stops that were made, maybe on another map.
 
     Raises:
         TaskRefusedError: A cell cannot be entered.
     """
-    for cell in order.cells():
+    for cell in order.cells(made):
         if cell not in grid:
             raise TaskRefusedError(
                 f"cell {cell} is not on the map of {len(grid)} cells (0 .. {len(grid) - 1})"

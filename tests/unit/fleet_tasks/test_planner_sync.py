@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 from support.planner_copy import RUN, SPILL, Both
 
+from rce_fleet.exceptions import TaskRefusedError
 from rce_fleet.limits import MOST_LIFETIME
 from rce_fleet.manager.convert import show_profile
 from rce_fleet.manager.planner_sync import (
@@ -23,6 +24,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.energy import effort_of
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+from rce_fleet.tasks.loads import settle_load
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.records import (
     FleetEntry,
@@ -349,6 +351,34 @@ def test_another_grid_holds_tasks_and_removes_places() -> None:
     assert names[-2:] == ["places", "planner"]
     both.sync.begin(PlannerRun("3.0", "16 x 16"), both.now)
     assert [event.name for event in book.take_events()] == ["planner"]
+
+
+def test_a_begun_task_gets_cells_of_another_grid() -> None:
+    """The stop that was made is in a cell that the smaller grid does not have."""
+    both = Both()
+    book = both.book
+    stops = (Stop(Action.PICK, (40,)), Stop(Action.DELIVER, (50,)))
+    task = book.create(Order(stops, return_cells=(3,)), both.now)
+    book.put_record(replace(task, state=TaskState.RUNNING, robot="Robot1", position=1, loads=1, target=50))
+    both.sync.begin(PlannerRun("2.0", "4 x 4"), both.now)
+    book.grid = GridMap(4, 4)
+    with pytest.raises(TaskRefusedError, match="cell 50 is not on the map of 16 cells"):
+        book.change("T1", replace(task.order, priority=1), both.now)
+    wanted = replace(task.order, stops=(stops[0], Stop(Action.DELIVER, (9,))))
+    assert book.change("T1", wanted, both.now).order == wanted
+    assert book.resume("T1", both.now).state is TaskState.RUNNING
+    book.hold("T1", both.now)
+    settled = settle_load(book, "T1", 5, both.now)
+    assert [stop.cells for stop in settled.order.stops] == [(40,), (5,), (9,)]
+    with pytest.raises(TaskRefusedError, match="cell 40 is not on the map of 16 cells"):
+        book.create(wanted, both.now)
+
+
+def test_a_task_names_cells_of_stops_that_come_again() -> None:
+    stops = tuple(Stop(Action.GO, (cell,)) for cell in (1, 2, 3))
+    order = Order(stops, rounds=2, return_cells=(7,))
+    named = {made: list(order.cells(made)) for made in (0, 3, 4, 6)}
+    assert named == {0: [1, 2, 3, 7], 3: [1, 2, 3, 7], 4: [2, 3, 7], 6: [7]}
 
 
 def test_a_floor_of_an_earlier_release_is_the_same_turned_or_not() -> None:
