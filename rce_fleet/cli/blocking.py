@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import time
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +16,7 @@ import typer
 
 from rce_fleet.api.fleet import ZoneRequest
 from rce_fleet.cli.access import STATION, Station, checked, do
+from rce_fleet.cli.times import read_time
 from rce_fleet.exceptions import StationError
 
 if TYPE_CHECKING:
@@ -111,30 +111,6 @@ def free(
             typer.echo(f"{_word(place)} is free" + (f" for {', '.join(robots)}" if robots else ""))
 
     do(station, work)
-
-
-def read_time(text: str, now: float) -> float:
-    """Return a local time, or a time of day that comes next, in seconds since 1970.
-
-    Raises:
-        typer.BadParameter: The text is not a time, or it has passed.
-    """
-    today = datetime.fromtimestamp(now).astimezone().replace(tzinfo=None)
-    try:
-        if "-" in text:
-            found = datetime.fromisoformat(text)
-        else:
-            hour, minute = map(int, text.split(":"))
-            found = today.replace(hour=hour, minute=minute, second=0, microsecond=0)
-            found += timedelta(days=found <= today)
-    except ValueError:
-        raise typer.BadParameter(
-            f"expected a time such as 18:30 or 2026-11-28T18:30, found {text!r}", param_hint="--until"
-        ) from None
-    end = found.astimezone().timestamp()
-    if end <= now:
-        raise typer.BadParameter(f"{text} has passed", param_hint="--until")
-    return end
 
 
 def _places(texts: list[str] | None, lanes: list[str] | None) -> list[_Place]:

@@ -10,12 +10,16 @@ import typer
 from rce.printable import one_line
 from rce_fleet.api.tasks import LoadRequest, RepeatModel, StopModel, TaskChange, TaskModel, TaskRequest
 from rce_fleet.cli.access import STATION, AsJson, Station, checked, do, echo_json, echo_table
+from rce_fleet.cli.times import read_moment
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
 
 app = typer.Typer(no_args_is_help=True, help="Add, show, change, hold and cancel tasks.")
 
+Deadline = Annotated[
+    str, typer.Option(help="Seconds from now, or a local time such as 18:30 or 2026-11-28T18:30; 0: none.")
+]
 Id = Annotated[str, typer.Argument(metavar="TASK", help="Its id, as rce fleet tasks lists it.")]
 
 
@@ -72,8 +76,10 @@ def add(
     deliver: Annotated[int | None, typer.Option(help="Deliver the load here at the end.")] = None,
     duration: Annotated[float, typer.Option(help="Seconds of each action.")] = 0.0,
     priority: Annotated[int, typer.Option(help="Larger numbers come first.")] = 0,
-    deadline: Annotated[float, typer.Option(help="Seconds from now; 0: none.")] = 0.0,
-    start: Annotated[float, typer.Option(help="Seconds from now before which no robot begins.")] = 0.0,
+    deadline: Deadline = "",
+    start: Annotated[
+        str, typer.Option(help="No robot begins before; seconds from now or a time, as for --deadline.")
+    ] = "",
     robot: Annotated[str, typer.Option(help="The only robot that may do it.")] = "",
     after: Annotated[list[str] | None, typer.Option(help="A task that must be done before.")] = None,
     rounds: Annotated[int, typer.Option(help="How often the stops are made.")] = 1,
@@ -84,7 +90,13 @@ def add(
         int | None, typer.Option(help="Occurrences in all, with --every (default: until cancelled).")
     ] = None,
     name: Annotated[str, typer.Option(help="For people.")] = "",
-    key: Annotated[str, typer.Option(help="Your own key: the same key makes one task only.")] = "",
+    key: Annotated[
+        str,
+        typer.Option(
+            help="Your own key: the same key makes one task only. Repeat all options with it;"
+            " --deadline and --start as dates, because seconds from now are another time then."
+        ),
+    ] = "",
     station: Station = STATION,
 ) -> None:
     """Create a task; print its id."""
@@ -103,8 +115,8 @@ def add(
             name=name,
             rounds=rounds,
             priority=priority,
-            deadline=now + deadline if deadline else None,
-            earliest_start=now + start if start else None,
+            deadline=read_moment(deadline, now, "--deadline"),
+            earliest_start=read_moment(start, now, "--start"),
             robot=robot,
             after=after or [],
             repeat=None if every is None else RepeatModel(every=every, count=count),
@@ -140,7 +152,7 @@ def show(task_id: Id, json_: AsJson = False, station: Station = STATION) -> None
 def change(
     task_id: Id,
     priority: Annotated[int | None, typer.Option(help="Larger numbers come first.")] = None,
-    deadline: Annotated[float | None, typer.Option(help="Seconds from now; 0: none.")] = None,
+    deadline: Deadline = "",
     name: Annotated[str | None, typer.Option(help="For people.")] = None,
     station: Station = STATION,
 ) -> None:
@@ -148,8 +160,8 @@ def change(
     changes: dict[str, object] = {}
     if priority is not None:
         changes["priority"] = priority
-    if deadline is not None:
-        changes["deadline"] = time.time() + deadline if deadline else None
+    if deadline:
+        changes["deadline"] = read_moment(deadline, time.time(), "--deadline")
     if name is not None:
         changes["name"] = name
     if not changes:

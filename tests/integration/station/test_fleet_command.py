@@ -6,7 +6,6 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from rce_fleet.api.fleet import (
 )
 from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
 from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
-from rce_fleet.cli.blocking import read_time
 from rce_fleet.cli.commands import app as commands
 from rce_master.cli.credentials import FILE_VARIABLE
 
@@ -249,6 +247,24 @@ async def test_rce_fleet_adds_a_recurring_task(station: Station, url: str) -> No
     assert len(station.bodies) == 2
 
 
+async def test_rce_fleet_repeats_a_task_with_its_dates(station: Station, url: str) -> None:
+    """Seconds from now would be another content, which a second request with the key must not have."""
+    words = ["task", "add", "--cell", "5", "--key", "order-1"]
+    dates = ["--start", "2026-11-28T18:00", "--deadline", "2026-11-28T18:30"]
+    for _ in range(2):
+        assert await run(url, *words, *dates) == (0, "T7\n")
+    first, second = station.bodies
+    assert first == second
+    assert first["deadline"] - first["earliest_start"] == 1800
+    now = time.time()
+    assert (await run(url, "task", "add", "--cell", "5", "--deadline", "600", "--start", "0"))[0] == 0
+    assert now + 600 <= station.bodies[2]["deadline"] <= time.time() + 600
+    assert station.bodies[2]["earliest_start"] is None
+    code, told = await run(url, "task", "add", "--cell", "5", "--deadline", "soon")
+    told = " ".join(told.replace("│", " ").split())
+    assert (code, "expected seconds from now, or a time such as 18:30" in told) == (2, True), told
+
+
 async def test_rce_fleet_makes_lists_and_removes_zones(station: Station, url: str) -> None:
     """With a reason, an end, robots and moves."""
     now = time.time()
@@ -374,10 +390,3 @@ async def test_places_and_times_that_are_none(
     code, told = await run(url, "block", *words)
     assert (code, station.changes) == (2, [])
     assert text in " ".join(told.replace("│", " ").split())
-
-
-def test_a_time_of_day_is_the_next_one() -> None:
-    now = datetime(2026, 11, 27, 12, 0).astimezone().timestamp()
-    assert read_time("18:30", now) - now == 6.5 * 3600
-    assert read_time("11:30", now) - now == 23.5 * 3600
-    assert read_time("2026-11-28T12:00", now) - now == 24 * 3600
