@@ -118,6 +118,8 @@ class EndpointLinks:
         elif link.spec != spec:
             redial = spec.dial and _must_redial(link, spec.address)
             link.change(spec)
+            if (far := self._far_ends.get(spec.id)) is not None:
+                far.change(spec)
             if redial and not self.is_awaited(link):
                 self._stop_dialing(link)
                 link.detach()
@@ -151,6 +153,8 @@ class EndpointLinks:
         self._links[link.spec.id] = link
         if not link.spec.dial:
             self._hub.register(link)
+        elif self._dials[link].done():  # a copy of an earlier release cannot stand by: it is dialed now
+            self.dial(link)
 
     def drop(self, links: list[Link]) -> list[Carrier]:
         """Forget links; return the carriers that are still closing."""

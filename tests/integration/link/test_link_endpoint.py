@@ -205,6 +205,40 @@ async def test_two_interfaces_of_one_endpoint_are_joined(rig: Rig) -> None:
     assert not any(party.endpoint.interfaces.values())
 
 
+async def test_a_copy_that_takes_over_is_joined_with_itself(rig: Rig) -> None:
+    """Messages and calls pass from both ends of its link with itself, and what they latched before."""
+    party = rig.party("a", await rig.hub())
+    types = {
+        "out1": "SubscriberConverter",
+        "in1": "PublisherConverter",
+        "out2": "SubscriberConverter",
+        "in2": "PublisherConverter",
+        "ask1": "ServiceProviderConverter",
+        "serve1": "ServiceClientConverter",
+        "ask2": "ServiceProviderConverter",
+        "serve2": "ServiceClientConverter",
+    }
+    ends = [("out1", "in1"), ("in2", "out2"), ("ask1", "serve1"), ("serve2", "ask2")]
+    link = LinkSpec(id="L", peer=party.spec.id, token="secret", dial=False, copy=True)
+    connections = [
+        ConnectionSpec(id=n, link="L", interface=one, peer_interface=other)
+        for n, (one, other) in enumerate(ends, 1)
+    ]
+    await party.apply(types, [link], connections)
+    await party.connected(1, 2, 3, 4)
+    for number in "12":
+        party.fakes[f"out{number}"].port.send(b"lost")
+        party.fakes[f"out{number}"].port.send(b"map", latched=True)
+    await party.apply(links=[replace(link, copy=False)])
+    for number in "12":
+        assert await party.fakes[f"ask{number}"].port.call(b"loud") == b"LOUD"
+        party.fakes[f"out{number}"].port.send(b"hello")
+        received = party.fakes[f"in{number}"].received
+        assert await received.get() == (b"map", True)
+        assert await received.get() == (b"hello", False)
+    assert party.faults == []
+
+
 async def test_a_connection_with_itself_to_nothing_is_told_once(rig: Rig) -> None:
     party = rig.party("a", await rig.hub())
     link = LinkSpec(id="L", peer=party.spec.id, token="secret", dial=False)

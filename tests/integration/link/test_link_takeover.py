@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 from support.link_kinds import SERVICE_OUT, TOPIC_IN, TOPIC_OUT
 
 from rce.control.model import LinkAddress, LinkSpec
 from rce.link import LinkLostError, LinkRefusedError
+from rce.link.frames import Frame, FrameType, encode
+from rce.link.handshake import LATCH, Welcome
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig
@@ -199,6 +202,38 @@ async def test_robot_that_links_late_changes_at_once(rig: Rig) -> None:
     await former.connected()
     assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
     assert robot.fakes["i3"].active == [True]
+
+
+@pytest.mark.parametrize("robot_dials", [True], ids=["robot-dials"])
+async def test_copy_of_an_earlier_release_is_dialed_in_the_end(
+    move: Move, monkeypatch: pytest.MonkeyPatch, *, robot_dials: bool
+) -> None:
+    """It cannot stand by: the robot gives that up at first, and dials it again when it took over."""
+    robot, former, copy = move.robot, move.former, move.copy
+    greeted = asyncio.Event()
+
+    def welcome() -> bytes:
+        greeted.set()
+        payload = msgspec.json.encode(Welcome(features=(LATCH,)))
+        return encode(Frame(FrameType.WELCOME, payload=payload))
+
+    monkeypatch.setattr("rce.link.hub.encode_welcome", welcome)
+    (end,), (link,) = former.spec.links, robot.spec.links
+    interfaces = {one.tag: one.type for one in former.spec.interfaces}
+    await copy.apply(interfaces, [replace(end, copy=True)], list(former.spec.connections))
+    await robot.apply(links=[replace(link, next=copy.address)])
+    await greeted.wait()
+    async with asyncio.timeout(60):
+        while copy.hub._carriers:
+            await asyncio.sleep(0.01)
+    assert robot.fakes["i3"].active == [True]
+    await move.take_over()
+    await copy.connected(*ALL)
+    await robot.connected(*ALL)
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    assert copy.fakes["i3"].asked.is_set()
+    robot.fakes["i1"].port.send(b"to the new place")
+    assert await copy.fakes["i1"].received.get() == (b"to the new place", False)
 
 
 async def test_links_that_break_before_the_takeover_are_made_again(move: Move, *, robot_dials: bool) -> None:
