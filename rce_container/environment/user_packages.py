@@ -88,7 +88,12 @@ class UserPackages:
             if interface in before or interface.message_type.partition("/")[0] not in coming
         )
         tags = {interface.tag for interface in kept}
-        connections = tuple(one for one in spec.connections if one.interface in tags)
+        with_itself = {link.id for link in spec.links if link.peer == spec.id}
+        connections = tuple(
+            one
+            for one in spec.connections
+            if one.interface in tags and (one.link not in with_itself or one.peer_interface in tags)
+        )
         return msgspec.structs.replace(spec, interfaces=kept, connections=connections)
 
     def launch_environment(self, node: NodeSpec, environ: Mapping[str, str]) -> LaunchEnvironment:
