@@ -190,14 +190,14 @@ class Outbox:
     def shed(self, size: int) -> None:
         """Drop the oldest messages of the topics that hold most, until ``size`` bytes are free.
 
-        Latched messages are dropped last.
+        Latched messages are dropped last; statements about all sources stay.
         """
         goal = self.bytes - size
         while self.bytes > goal and self._drop_of_largest_topic():
             pass
         for flow in list(self._ring):
             for source, counted in list(flow.latched.items()):
-                if self.bytes > goal and counted:
+                if source != "" and counted and self.bytes > goal:
                     self.drop_latched(flow.tag, source)
 
     def clear(self) -> None:

@@ -227,6 +227,17 @@ def test_latched_messages_go_last_when_memory_is_short() -> None:
     assert not outbox
 
 
+def test_a_statement_about_sources_outlives_short_memory() -> None:
+    """It may take messages back that the robot got before."""
+    outbox = Outbox()
+    outbox.put_latched("map", "", Outgoing(b"sources"), shared=False)
+    outbox.put_latched("map", "1", Outgoing(b"m" * 90), shared=False)
+    outbox.shed(1000)
+    assert drain(outbox) == ["sources"]
+    assert outbox.bytes == 0
+    assert outbox.dropped["map"] == 1
+
+
 def test_each_source_has_a_latched_message_and_names_it() -> None:
     """One that ends before its message was sent takes back its own only."""
     outbox = Outbox()
