@@ -341,7 +341,7 @@ def _bring_along(tx: Transaction, move: Move, unit: list[Container]) -> bool:
 def _is_ready(tx: Transaction, move: Move) -> bool:
     """Whether the copy's nodes are up, as far as those of the container are."""
     status, former = move.status, tx.tables.container_live(move.id).status
-    if status is None:
+    if status is None or status.revision <= 0:  # without its spec it reports no nodes
         return False
     no_further = {n.tag for n in former.nodes if n.state not in _UP} if former is not None else set()
     if any(node.state in _NOT_YET and node.tag not in no_further for node in status.nodes):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Unpack
 
 import pytest
+from msgspec.structs import replace
 from support.master_world import World
 from support.parts import StatusParts
 
@@ -60,6 +61,17 @@ def two() -> World:
     world.connect("rob/out", "c/in")
     world.container_set("c2", name="m2", slots=4)
     return world
+
+
+def test_a_copy_without_its_spec_does_not_take_over(two: World) -> None:
+    """Its environment runs, and has yet to be told of its nodes."""
+    two.node("d", "n")
+    two.do(commands.MoveContainer(user="anna", tag="d", machine="m2"))
+    status = EndpointStatus(id="anna/d", revision=0, state=EndpointState.RUNNING)
+    two.report("c2", status)
+    assert at(two, "d") == "c1"
+    two.report("c2", replace(status, revision=1))
+    assert at(two, "d") == "c2"
 
 
 def test_a_copy_is_made_first_and_takes_over_when_it_is_up(two: World) -> None:
