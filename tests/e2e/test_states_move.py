@@ -16,6 +16,7 @@ from typing import Any
 
 import psutil
 import pytest
+from support.container_nodes import NODES
 from support.engine import Program, engine_processes, until
 from support.etcd import cluster
 from support.master_program import environment, rce
@@ -33,6 +34,8 @@ NODE = {
     "exe": "counter.py",
     "state_services": {"save": "save_count", "restore": "restore_count", "every": 1},
 }
+FIXED = NODE | {"pkg": "own", "exe": "fixed_state.py"}
+"""Its state is drawn when it starts, and stays."""
 WAIT_S = 180.0
 ENOUGH = 20
 """More than a counter that starts anew reaches before its first snapshot."""
@@ -51,7 +54,11 @@ class Machine(Program):
             *("--machine", name, "--state-dir", str(self.folder / "state")),
             *("--link-port", str(free_port())),
         ]
-        super().__init__(name, argv, environment(folder) | {"XDG_RUNTIME_DIR": str(self.folder)}, folder)
+        env = environment(folder) | {
+            "XDG_RUNTIME_DIR": str(self.folder),
+            "RCE_PACKAGE_PATH": str(folder / "packages"),
+        }
+        super().__init__(name, argv, env, folder)
 
     async def lose(self) -> None:
         """Kill -9 the task set and all that it started, as when its machine is switched off."""
@@ -167,6 +174,10 @@ class Cloud:
 
 @asynccontextmanager
 async def counting(folder: Path, url: str, token: str, hosts: str) -> AsyncIterator[Cloud]:
+    package = folder / "packages" / "own"
+    (package / "nodes").mkdir(parents=True)
+    (package / "package.yaml").write_text("name: own\n")
+    (package / "nodes" / "fixed_state.py").write_text(NODES["fixed_state.py"])
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(ApiClient(url, token))
         cloud = Cloud(client, folder, hosts)
@@ -237,6 +248,34 @@ async def test_a_count_moves_with_a_volume(folder: Path) -> None:
             await cloud.drained("second", "first")
             (volume,) = (await cloud.call("GET", "/volumes"))["volumes"]
             assert volume["machine"] == "first"
+            await cloud.call("DELETE", "/containers/C")
+    finally:
+        assert await master.stop() == 0
+
+
+async def test_a_state_that_was_removed_moves(folder: Path) -> None:
+    """It has not changed since its snapshot, and the node that has it is saved for the move."""
+    master = Single(folder)
+    await master.start(ready="rce-master ready")
+    try:
+        hosts = f"127.0.0.1:{master.control_port}"
+        async with counting(folder, master.url, await log_in(master), hosts) as cloud:
+            await cloud.start(cloud.machines[0])
+            await cloud.call("POST", "/containers", {"tag": "C"})
+            await cloud.call("POST", "/containers/C/nodes", FIXED)
+            first = await until(cloud.state, timeout=WAIT_S, what="the state is saved")
+            await cloud.start(cloud.machines[1])
+            await cloud.call("DELETE", "/states/C/count")
+            assert await cloud.state() == {}
+            await cloud.call("PUT", "/containers/C/machine", {"machine": "second"})
+            await cloud.is_up_at("second")
+
+            async def saved_there() -> dict[str, Any]:
+                state = await cloud.state()
+                return state if state.get("machine") == "second" else {}
+
+            state = await until(saved_there, timeout=WAIT_S, what="the state is saved there")
+            assert state["sha256"] == first["sha256"]
             await cloud.call("DELETE", "/containers/C")
     finally:
         assert await master.stop() == 0

@@ -28,6 +28,7 @@ NODES = {
     "huge.py": _STATEFUL.format(name="huge", state="bytes((16 << 20) + 1)", wait="pass"),
     "grow.py": _STATEFUL.format(name="grow", state="b''", wait="nonlocal state\n        state += b'x'"),
     "echo_state.py": _STATEFUL.format(name="large", state="b''", wait="pass"),
+    "fixed_state.py": _STATEFUL.format(name="fixed", state="__import__('os').urandom(8)", wait="pass"),
     "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
     "keep.py": (
         "import os, pathlib, time\n"

@@ -29,6 +29,8 @@ RETRY = Backoff(first=0.2, longest=5.0)
 """Delays before a snapshot that could not be fetched is asked for again."""
 TOLD_AFTER_S = 10.0
 """Seconds without a kept snapshot until that is told: another master may take the lead meanwhile."""
+REPEAT_S = 300.0
+"""Seconds after which an equal snapshot is sent again: the master may have lost the one before."""
 
 
 class Vault(Protocol):
@@ -104,7 +106,7 @@ class NodeStates:
                 del self._savers[spec.tag]
 
     async def save_now(self, tag: str) -> str:
-        """Save a node's state at once.
+        """Save a node's state at once, also if it has not changed.
 
         Returns:
             Why it is not saved; empty if it is.
@@ -112,7 +114,7 @@ class NodeStates:
         saver = self._savers.get(tag)
         if saver is None:
             return f"node {tag} does not run, or its state was not restored"
-        return await saver.save()
+        return await saver.save(again=True)
 
     async def _fetch(self, tag: str, life: int, feed: Callable[[Event], None]) -> bytes | None:
         pauses = RETRY.start()
@@ -134,7 +136,7 @@ class NodeStates:
 
 
 class _Saver:
-    """Makes snapshots of one life of a node, one at a time; equal ones are kept once."""
+    """Makes snapshots of one life of a node, one at a time; equal ones are rarely sent again."""
 
     def __init__(
         self, graph: Graph, vault: Vault, tag: str, service: str, tell: Callable[[str], None]
@@ -146,15 +148,20 @@ class _Saver:
         self._tell = tell
         self._lock = asyncio.Lock()
         self._kept = b""
-        """Hash of the last snapshot that was acknowledged."""
+        """Hash of the last snapshot that was acknowledged; empty while it is not known which one counts."""
+        self._kept_at = 0.0
         self._failing_since: float | None = None
 
-    async def save(self) -> str:
-        """Make a snapshot; return why there is none."""
+    async def save(self, *, again: bool = False) -> str:
+        """Make a snapshot; return why there is none.
+
+        Args:
+            again: Whether it is sent also if it is equal to the one before.
+        """
         async with self._lock:
             now = asyncio.get_running_loop().time()
             try:
-                await self._save()
+                await self._save(again=again or now - self._kept_at >= REPEAT_S)
             except GraphError as error:
                 text = f"its state is not saved: {error}"
             except NodeStateError as error:
@@ -167,14 +174,15 @@ class _Saver:
             self._tell(text)
             return text
 
-    async def _save(self) -> None:
+    async def _save(self, *, again: bool) -> None:
         state = await self._graph.save_state(self._service, CALL_S)
         if len(state) > MAX_STATE:
             raise GraphError(f"it is larger than {MAX_STATE // MEGABYTE} MB, which is the most")
         digest = await asyncio.to_thread(lambda: hashlib.sha256(state).digest())
-        if digest != self._kept:
+        if again or digest != self._kept:
+            self._kept = b""  # if the answer is lost, this one may count as well as the one before
             await self._vault.keep(self._tag, state)
-            self._kept = digest
+            self._kept, self._kept_at = digest, asyncio.get_running_loop().time()
 
 
 def _global(spec: NodeSpec, name: str) -> str:

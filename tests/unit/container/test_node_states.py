@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 import pytest
+from msgspec.structs import replace
 
 from rce.aio.tasks import cancel_and_wait
 from rce.model import MAX_STATE, NodeSpec, StateServices
@@ -24,6 +25,7 @@ NODE = NodeSpec(
     name="counter",
     state_services=StateServices(save="save", restore="~restore", every=86400.0),
 )
+OFTEN = replace(NODE, state_services=StateServices(save="save", restore="~restore", every=0.01))
 
 
 class FakeGraph:
@@ -31,6 +33,8 @@ class FakeGraph:
 
     def __init__(self) -> None:
         self.state = b"fresh"
+        self.next_states: list[bytes] = []
+        """Those that it has at the next saves."""
         self.fault = ""
         self.calls: list[str] = []
 
@@ -44,11 +48,16 @@ class FakeGraph:
 
     async def save_state(self, service: str, timeout: float) -> bytes:
         self._check(f"save {service}")
+        if self.next_states:
+            self.state = self.next_states.pop(0)
         return self.state
 
     async def restore_state(self, service: str, state: bytes, timeout: float) -> None:
         self._check(f"restore {service}")
         self.state = state
+
+    def saves(self) -> int:
+        return self.calls.count("save /ns/save")
 
 
 class FakeVault:
@@ -57,6 +66,8 @@ class FakeVault:
     def __init__(self, state: bytes | None = None) -> None:
         self.state = state
         self.faults: list[str] = []
+        self.unanswered: set[bytes] = set()
+        """Those that it keeps without an acknowledgement."""
         self.kept: list[bytes] = []
 
     async def fetch(self, node: str) -> bytes | None:
@@ -68,6 +79,8 @@ class FakeVault:
         if self.faults:
             raise NodeStateError(self.faults.pop())
         self.kept.append(state)
+        if state in self.unanswered:
+            raise NodeStateError("the container's manager went away")
 
 
 class Run:
@@ -94,9 +107,9 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @asynccontextmanager
-async def running(graph: FakeGraph, vault: FakeVault) -> AsyncIterator[Run]:
+async def running(graph: FakeGraph, vault: FakeVault, node: NodeSpec = NODE) -> AsyncIterator[Run]:
     run = Run(graph, vault)
-    task = asyncio.create_task(run.states.keep(NODE, 7, run.events.append))
+    task = asyncio.create_task(run.states.keep(node, 7, run.events.append))
     try:
         await until(lambda: run.restored is not None)
         yield run
@@ -139,11 +152,36 @@ async def test_fetching_is_tried_again_until_it_is_known() -> None:
 
 
 async def test_equal_states_are_kept_once() -> None:
-    async with running(FakeGraph(), FakeVault()) as run:
-        for state in (b"1", b"1", b"2", b"1"):
-            run.graph.state = state
-            assert await run.states.save_now("n") == ""
+    graph = FakeGraph()
+    graph.next_states = [b"1", b"1", b"2", b"1"]
+    async with running(graph, FakeVault(), OFTEN) as run:
+        await until(lambda: graph.saves() > 5)
         assert run.vault.kept == [b"1", b"2", b"1"]
+
+
+async def test_equal_state_is_kept_again_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The master may have lost it: a backup was restored, or it was removed on request."""
+    monkeypatch.setattr(states, "REPEAT_S", 0.0)
+    async with running(FakeGraph(), FakeVault(), OFTEN) as run:
+        await until(lambda: len(run.vault.kept) > 1)
+
+
+async def test_equal_state_is_kept_again_on_request() -> None:
+    """What saves it for a move relies on it."""
+    async with running(FakeGraph(), FakeVault()) as run:
+        for _ in range(2):
+            assert await run.states.save_now("n") == ""
+        assert run.vault.kept == [b"fresh", b"fresh"]
+
+
+async def test_state_before_an_unknown_outcome_is_kept_again() -> None:
+    """The node returned to it, and the vault has the one in between."""
+    graph, vault = FakeGraph(), FakeVault()
+    graph.next_states = [b"A", b"B", b"A"]
+    vault.unanswered = {b"B"}
+    async with running(graph, vault, OFTEN):
+        await until(lambda: graph.saves() > 3)
+        assert vault.kept == [b"A", b"B", b"A"]
 
 
 async def test_an_outage_of_the_vault_is_told_if_it_lasts() -> None:
