@@ -49,11 +49,16 @@ class Sent:
     aiohttp repeats DELETE and PUT once, by itself, if the connection is lost before the answer.
 
     Attributes:
-        begun: Whether some of the request may have arrived.
+        times: How often some of the request may have arrived.
     """
 
     def __init__(self) -> None:
-        self.begun = False
+        self.times = 0
+
+    @property
+    def begun(self) -> bool:
+        """Whether some of the request may have arrived."""
+        return self.times > 0
 
 
 def noting_sent() -> aiohttp.TraceConfig:
@@ -61,7 +66,7 @@ def noting_sent() -> aiohttp.TraceConfig:
 
     async def note(_: aiohttp.ClientSession, context: SimpleNamespace, __: object) -> None:
         if isinstance(context.trace_request_ctx, Sent):
-            context.trace_request_ctx.begun = True
+            context.trace_request_ctx.times += 1
 
     trace = aiohttp.TraceConfig()
     trace.on_request_headers_sent.append(note)

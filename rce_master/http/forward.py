@@ -17,6 +17,7 @@ from rce.web.client import Sent, noting_sent
 from rce.web.origin import is_foreign
 from rce.web.writing import write
 from rce_master.http.forwarded import HEADER
+from rce_master.leadership.core import STANDBY_HEADER
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -162,6 +163,9 @@ class Forwarder:
                     trace_request_ctx=sent,
                 ) as reply,
             ):
+                if sent.times > 1 and STANDBY_HEADER in reply.headers:
+                    # It did not do the second one, and may have done the first one while it led.
+                    return self._broken(request, leader, None, ConnectionError("it leads no more"), sent)
                 response = web.StreamResponse(
                     status=reply.status, reason=reply.reason, headers=_without(reply.headers)
                 )

@@ -84,6 +84,38 @@ async def test_a_stand_by_tells_that_a_request_may_be_done(method: str, status: 
                     assert reply.status == expected
 
 
+@pytest.mark.parametrize(("method", "status"), [("DELETE", 502), ("POST", 502), ("GET", 503)])
+async def test_no_stand_by_denies_what_it_did_as_leader(method: str, status: int) -> None:
+    """It loses the lead as it answers; aiohttp repeats a DELETE then, which finds a stand-by."""
+    asked = 0
+
+    async def answer(request: web.Request) -> web.Response:
+        nonlocal asked
+        asked += 1
+        if asked == 1 and request.transport is not None:
+            request.transport.abort()
+        return web.Response(status=503, headers={"RCE-Standby": "yes"})
+
+    async def forward(request: web.Request) -> web.StreamResponse:
+        try:
+            return await forwarder.forward(request, Leader("first", 1, str(leader.make_url("/"))))
+        except NotForwardedError:
+            return web.Response(status=503, headers={"RCE-Standby": "yes"})
+
+    masters = [web.Application() for _ in range(2)]
+    masters[0].router.add_route("*", "/a", answer)
+    masters[1].router.add_route("*", "/a", forward)
+    async with (
+        TestServer(masters[0]) as leader,
+        TestServer(masters[1]) as standby,
+        Forwarder(FORWARDING, TrustedProxies()) as forwarder,
+        aiohttp.ClientSession() as session,
+        session.request(method, standby.make_url("/a")) as reply,
+    ):
+        assert reply.status == status
+        assert ("RCE-Standby" in reply.headers) == (method == "GET")
+
+
 @pytest.mark.parametrize(("method", "status"), [("POST", 502), ("GET", 503)])
 async def test_a_request_to_a_leader_that_vanished_ends_with_its_lead(method: str, status: int) -> None:
     """Its machine was cut off: no connection breaks, and TCP would go on for many minutes."""
