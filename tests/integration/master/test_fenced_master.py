@@ -6,7 +6,19 @@ import asyncio
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
 
+from rce.config.settings import LOOPBACK
+from rce.control import decode_to_task_set, encode
+from rce.control.messages import (
+    CONTROL_VERSION,
+    ClientReply,
+    ClientRequest,
+    Hello,
+    MachineInfo,
+    TaskSetKind,
+)
 from rce_master import master
 from rce_master.exceptions import FencedError
 from rce_master.http import api_exec, api_stream
@@ -97,3 +109,21 @@ async def test_output_of_commands_ends_with_the_lead(lead: Lead) -> None:
     with pytest.raises(FencedError):
         await api_exec._to_user(cast("Any", LeadingCall(lead)), cast("Any", output()), cast("Any", user))
     assert user.frames == [b"1"]
+
+
+async def test_task_sets_hear_nothing_after_the_lead_is_lost(run_site: RunSite, lead: Lead) -> None:
+    machine = MachineInfo(name="machine", cores=2)
+    hello = Hello(version=CONTROL_VERSION, kind=TaskSetKind.CONTAINER, process="c1", machine=machine)
+    question = ClientRequest(request=1, id="anna/rob", type="CC", data=None)
+    async with run_site(fence=lead.fence) as site, asyncio.timeout(60):
+        headers = {"Authorization": "Bearer a secret for the tests"}
+        url = f"ws://{LOOPBACK}:{site.master.control_port}/"
+        async with connect(url, additional_headers=headers) as task_set:
+            await task_set.send(encode(hello))
+            await task_set.send(encode(question))
+            while not isinstance(decode_to_task_set(await task_set.recv()), ClientReply):
+                continue
+            lead.end()
+            await task_set.send(encode(question))
+            with pytest.raises(ConnectionClosed):
+                await task_set.recv()

@@ -15,6 +15,8 @@ from rce.control_channel.peer import Peer
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from websockets.asyncio.server import ServerConnection
 
 LIMIT = 1 << 20
@@ -48,15 +50,19 @@ def socket() -> Socket:
     return Socket()
 
 
-@pytest.fixture
-def peer(socket: Socket) -> Peer:
+def peer_of(socket: Socket, is_fenced: Callable[[], bool] | None = None) -> Peer:
     hello = Hello(
         version=CONTROL_VERSION,
         kind=TaskSetKind.CONTAINER,
         process="c1",
         machine=MachineInfo(name="m"),
     )
-    return Peer(hello, cast("ServerConnection", socket), DEFAULT_TIMEOUTS)
+    return Peer(hello, cast("ServerConnection", socket), DEFAULT_TIMEOUTS, is_fenced)
+
+
+@pytest.fixture
+def peer(socket: Socket) -> Peer:
+    return peer_of(socket)
 
 
 async def test_a_peer_that_reads_nothing_is_cut_off(peer: Peer, socket: Socket) -> None:
@@ -87,3 +93,15 @@ async def test_a_whole_state_may_be_longer(peer: Peer, socket: Socket) -> None:
     for _ in range(10):
         peer.send(LONG)
     assert not socket.is_aborted
+
+
+async def test_a_master_that_lost_the_lead_sends_nothing(socket: Socket) -> None:
+    socket.free.set()
+    peer = peer_of(socket, is_fenced=lambda: True)
+    peer.send(LONG)
+    pumping = asyncio.create_task(peer.pump())
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert socket.sent == []
+    assert socket.is_aborted
+    await cancel_and_wait(pumping)
