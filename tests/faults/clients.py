@@ -7,7 +7,7 @@ import itertools
 import random
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from http import HTTPStatus
 from typing import Any
@@ -22,6 +22,7 @@ from rce_master.leadership.core import STANDBY_HEADER
 USER = "testUser"
 REGISTER_USERS = ("registers1", "registers2")
 KINDS = ("containers", "slots", "packages")
+REGISTERS = frozenset(f"{user}/{kind}" for user in REGISTER_USERS for kind in KINDS)
 INITIAL = 1_000_000
 """Of all registers, which are limits of users."""
 TIMEOUT_S = 3.0
@@ -72,7 +73,8 @@ class Clients:
     def session(self, timeout: float = TIMEOUT_S) -> aiohttp.ClientSession:
         """Return a session of the logged-in user."""
         headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
-        return aiohttp.ClientSession(headers=headers, timeout=aiohttp.ClientTimeout(total=timeout))
+        limit = aiohttp.ClientTimeout(total=timeout)
+        return aiohttp.ClientSession(headers=headers, timeout=limit, middlewares=(_send_once,))
 
     async def _asked(self, method: str, url: str, body: object = None) -> dict[str, Any]:
         async with self.session(PATIENCE_S) as session, session.request(method, url, json=body) as reply:
@@ -133,8 +135,20 @@ class Clients:
             self.check()
             return sum(start >= since for start, _ in self._history.acknowledged) >= count
 
+        await self._until(enough, f"{count} writes are acknowledged")
+
+    async def wait_for_reads(self, since: float) -> None:
+        """Wait until a read of each register is answered that was asked for after a time."""
+
+        def enough() -> bool:
+            self.check()
+            return self._history.read_since(since) >= REGISTERS
+
+        await self._until(enough, "all registers are read")
+
+    async def _until(self, condition: Callable[[], bool], what: str) -> None:
         try:
-            await until(enough, timeout=PATIENCE_S, what=f"{count} writes are acknowledged")
+            await until(condition, timeout=PATIENCE_S, what=what)
         except AssertionError as error:
             raise AssertionError("\n".join([f"{error}; clients were answered:", *self._answers])) from error
 
@@ -181,15 +195,12 @@ class Clients:
     async def _change(
         self, session: aiohttp.ClientSession, name: str, method: str, url: str, body: object = None
     ) -> bool:
-        """Make or remove a container; return whether the master did it."""
+        """Make or remove a container; return whether a leading master answered."""
         before, known = self._history.containers[name], self._history.containers
         known[name] = Expected.EITHER  # if the test ends meanwhile, too
         fate, _ = await self._ask(session, method, url, body)
-        if fate is Fate.DONE:
-            known[name] = Expected.RUNS if method == "POST" else Expected.GONE
-        elif fate is Fate.NOT_DONE:
-            known[name] = before
-        return fate is Fate.DONE
+        self._history.changed_container(name, before, fate, made=method == "POST")
+        return fate in (Fate.DONE, Fate.MISSING)
 
     async def _write(self, user: str, used: int) -> None:
         async with self.session() as session:
@@ -228,7 +239,7 @@ class Clients:
                 if reply.status < 300:
                     return Fate.DONE, await reply.json() if reply.content_length else {}
                 if reply.status == HTTPStatus.NOT_FOUND and method == "DELETE":
-                    return Fate.DONE, {}
+                    return Fate.MISSING, {}
                 text = await reply.text()
                 assert reply.status in {500, 502, 503}, (reply.status, text)
                 self._answers.append(f"{method} {url}: {reply.status} {text}")
@@ -239,3 +250,13 @@ class Clients:
         finally:
             self._asking -= 1
         return Fate.UNKNOWN, {}
+
+
+async def _send_once(
+    request: aiohttp.ClientRequest, send: aiohttp.ClientHandlerType
+) -> aiohttp.ClientResponse:
+    """Send a request once: aiohttp would repeat a DELETE whose connection is lost, which may be done then."""
+    try:
+        return await send(request)
+    except aiohttp.ClientConnectionError as error:
+        raise aiohttp.ClientConnectionError(repr(error)) from error

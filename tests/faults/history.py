@@ -21,6 +21,8 @@ class Fate(Enum):
     DONE = "done"
     NOT_DONE = "not done"
     """The master said that nothing was done."""
+    MISSING = "missing"
+    """The master said that what was to be removed does not exist."""
     UNKNOWN = "unknown"
 
 
@@ -54,6 +56,9 @@ class History:
         heard: What masters told task sets, in the order in which it came.
         acknowledged: Start and end of each write that was acknowledged.
         lost_links: What robots saw of links that were interrupted.
+        lost_containers: Containers that ran by the answers of the masters, and were not found when they were
+            to be removed.
+        doubled_containers: Containers that ran twice for a while.
         cuts: Masters that were cut off, with start and end. TCP sends again what was on its way then, and
             it arrives when the network is back; task sets refuse it by its term.
         stops: Masters that were stopped, and when they went on. One that is stopped between its look at the
@@ -66,8 +71,12 @@ class History:
     heard: list[Heard] = field(default_factory=list)
     acknowledged: list[tuple[float, float]] = field(default_factory=list)
     lost_links: list[str] = field(default_factory=list)
+    lost_containers: list[str] = field(default_factory=list)
+    doubled_containers: set[str] = field(default_factory=set)
     cuts: list[tuple[str, float, float]] = field(default_factory=list)
     stops: list[tuple[str, float]] = field(default_factory=list)
+    _seen_twice: set[str] = field(default_factory=set)
+    """What ran twice at the last look."""
 
     def wrote(self, register: str, start: float, end: float, value: int, fate: Fate) -> None:
         """Note a write."""
@@ -80,6 +89,50 @@ class History:
     def read(self, register: str, start: float, end: float, value: int) -> None:
         """Note a read."""
         self.registers.setdefault(register, []).append(Operation(start, end, False, value))
+
+    def read_since(self, at: float) -> set[str]:
+        """Return the registers of which a read was answered that was asked for after a time."""
+        return {
+            name
+            for name, operations in self.registers.items()
+            if any(not each.is_write and each.start >= at for each in operations)
+        }
+
+    @property
+    def reads(self) -> int:
+        """How many reads of registers were answered."""
+        return sum(not each.is_write for operations in self.registers.values() for each in operations)
+
+    def changed_container(self, name: str, before: Expected, fate: Fate, *, made: bool) -> None:
+        """Note the answer to a request that makes or removes a container.
+
+        Args:
+            name: The container.
+            before: What was expected of it before the request.
+            fate: What the answer says of the request.
+            made: Whether it was to be made.
+        """
+        match fate:
+            case Fate.DONE:
+                self.containers[name] = Expected.RUNS if made else Expected.GONE
+            case Fate.NOT_DONE:
+                self.containers[name] = before
+            case Fate.MISSING:
+                if before is Expected.RUNS:
+                    self.lost_containers.append(name)
+                self.containers[name] = Expected.GONE
+            case Fate.UNKNOWN:
+                self.containers[name] = Expected.EITHER
+
+    def saw_running(self, running: Iterable[str]) -> None:
+        """Note a look at the containers. A process that was just forked may look like its parent in one look.
+
+        Args:
+            running: The containers that run, once for each.
+        """
+        twice = {name for name, times in Counter(running).items() if times > 1}
+        self.doubled_containers |= twice & self._seen_twice
+        self._seen_twice = twice
 
     def misplaced(self, running: Iterable[str]) -> list[str]:
         """Return what a task set does that was not asked for, or does not do that was.
@@ -125,14 +178,28 @@ class History:
         """
         return [
             *self.lost(Counter(stored)),
-            *(
-                f"{name} is not linearizable: {' '.join(map(str, unexplained(operations, initial)))}"
-                for name, operations in self.registers.items()
-                if not is_linearizable(operations, initial)
-            ),
+            *self.not_linearizable(initial),
             *self.of_older_terms(),
             *self.lost_links,
+            *self.wrong_containers(),
         ]
+
+    def not_linearizable(self, initial: int) -> Iterable[str]:
+        """Yield the registers whose reads and writes no order explains.
+
+        Args:
+            initial: What registers held at the start.
+        """
+        for name, operations in self.registers.items():
+            if not is_linearizable(operations, initial):
+                yield f"{name} is not linearizable: {' '.join(map(str, unexplained(operations, initial)))}"
+
+    def wrong_containers(self) -> Iterable[str]:
+        """Yield which containers were lost or ran twice while clients changed them."""
+        for name in self.lost_containers:
+            yield f"container {name} was acknowledged, and was not found when it was to be removed"
+        for name in sorted(self.doubled_containers):
+            yield f"container {name} ran twice for a while"
 
     def lost(self, stored: Counter[str]) -> Iterable[str]:
         """Yield what was acknowledged and is lost, refused and done, or done twice."""

@@ -27,6 +27,8 @@ from tools.leaks import sweep_cgroups
 PING_S = 0.1
 DIAL_S = 0.3
 """Pause between two attempts to reach a master as a task set, and the time that it has for its answer."""
+LOOK_S = 1.0
+"""Pause between two looks at the containers."""
 
 
 class Prober:
@@ -165,6 +167,26 @@ def running_containers(folder: Path) -> list[str]:
 
 
 @asynccontextmanager
+async def watched_containers(folder: Path, history: History) -> AsyncIterator[None]:
+    """Look at the containers that run all the time until it is left."""
+    ended = asyncio.Event()
+    watching = asyncio.create_task(_watch_containers(folder, history, ended))
+    try:
+        yield
+    finally:
+        ended.set()
+        await watching
+
+
+async def _watch_containers(folder: Path, history: History, ended: asyncio.Event) -> None:
+    while not ended.is_set():
+        # In a thread: a look takes as long as an answer of a master, and answers are timed.
+        history.saw_running(await asyncio.to_thread(running_containers, folder))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(ended.wait(), LOOK_S)
+
+
+@asynccontextmanager
 async def task_sets(cluster: Cluster, history: History) -> AsyncIterator[Robot]:
     """Run task sets with a robot that talks to its container until it is left."""
     made = TaskSets(cluster)
@@ -179,6 +201,7 @@ async def task_sets(cluster: Cluster, history: History) -> AsyncIterator[Robot]:
         await wire_echo(client)
         await until(lambda: _answers(client), timeout=PATIENCE_S, what="the robot's node answers")
         nodes = made.nodes()
+        assert nodes, "no node of the robot runs"
         robot = await stack.enter_async_context(Robot(client, history).talking())
         yield robot
         if made.nodes() != nodes:

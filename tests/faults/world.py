@@ -13,11 +13,11 @@ from pathlib import Path
 
 from support.engine import until
 
-from faults.clients import INITIAL, Clients
+from faults.clients import INITIAL, REGISTERS, Clients
 from faults.goals import Times
 from faults.history import Expected, History
 from faults.machines import PATIENCE_S, Cluster, Machine, cluster
-from faults.task_sets import Prober, Robot, running_containers, task_sets
+from faults.task_sets import Prober, Robot, running_containers, task_sets, watched_containers
 
 
 @dataclass
@@ -86,7 +86,9 @@ class World:
     async def whole(self) -> None:
         """Repair everything, and wait until it works."""
         await self.cluster.repair()
-        await self.clients.wait_for_writes()
+        since = time.monotonic()
+        await self.clients.wait_for_writes(since=since)
+        await self.clients.wait_for_reads(since)
 
     async def until_containers_are_right(self) -> None:
         """Wait until exactly the containers run that were acknowledged and not removed."""
@@ -111,8 +113,10 @@ def count_checked(times: Times, history: History, stored: list[str], misplaced: 
     times.checked("requests, lost or done twice", len(history.made) - lost, lost)
     acts = len(list(history.of_older_terms()))
     times.checked("messages to task sets, by a former leader", len(history.heard) - acts, acts)
+    times.checked("reads, not linearizable", history.reads, len(list(history.not_linearizable(INITIAL))))
     times.checked("robots' links, interrupted", 1, len(history.lost_links))
-    times.checked("containers, not as acknowledged", len(history.containers), len(misplaced))
+    wrong = len(misplaced) + len(list(history.wrong_containers()))
+    times.checked("containers, not as acknowledged", len(history.containers), wrong)
 
 
 @asynccontextmanager
@@ -122,7 +126,8 @@ async def world(
     """Run everything until it is left; check then what happened.
 
     Raises:
-        AssertionError: Something was lost, done twice or by a master that led no more, or a link was cut.
+        AssertionError: Something was lost, done twice or by a master that led no more, or a link was cut; or
+            too little was seen to tell.
     """
     rng, history = random.Random(seed), History()
     async with AsyncExitStack() as stack:
@@ -135,9 +140,12 @@ async def world(
             if robot:
                 made.robot = await running.enter_async_context(task_sets(machines, history))
             await running.enter_async_context(Prober(machines, history).running())
-            load = clients.under_load(containers=robot)
-            async with load:
+            async with AsyncExitStack() as load:
+                if robot:
+                    await load.enter_async_context(watched_containers(machines.folder, history))
+                await load.enter_async_context(clients.under_load(containers=robot))
                 yield made
+                ended = time.monotonic()
                 await made.whole()
             if robot:
                 await made.until_containers_are_right()
@@ -148,5 +156,7 @@ async def world(
             times.add("longest gap of the robot's echo", made.robot.longest_gap)
         assert not violations, f"seed {seed}:\n" + "\n".join(violations)
         assert history.heard, "no master told a task set anything"
+        unread = sorted(REGISTERS - history.read_since(ended))
+        assert not unread, f"not read after the last fault: {', '.join(unread)}"
         if robot:
             assert Expected.RUNS in history.containers.values(), "no container was made"

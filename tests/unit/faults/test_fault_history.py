@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import random
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, Self, cast
 
 import pytest
 from faults.catalogue import SCENARIOS
+from faults.clients import Clients
 from faults.goals import GOALS, Times
 from faults.history import Expected, Fate, Heard, History
 from faults.linearizability import Operation, is_linearizable, unexplained
@@ -209,3 +213,61 @@ def test_containers_run_as_they_were_acknowledged() -> None:
         "container c runs 2 times",
         "container e runs and was not asked for",
     ]
+
+
+class Answer:
+    """The used part of a master's answer."""
+
+    headers = ()
+    content_length = 0
+
+    def __init__(self, status: int) -> None:
+        self.status = status
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+
+class Session:
+    """Gets the same answer to each request."""
+
+    def __init__(self, status: int) -> None:
+        self._status = status
+
+    def request(self, *_: object, **__: object) -> Answer:
+        return Answer(self._status)
+
+
+@pytest.mark.parametrize(
+    ("before", "status", "lost"),
+    [(Expected.RUNS, 404, ["a"]), (Expected.EITHER, 404, []), (Expected.RUNS, 204, [])],
+)
+async def test_a_container_that_is_not_found_was_lost(before: Expected, status: int, lost: list[str]) -> None:
+    history = History(containers={"a": before})
+    clients = Clients(cast("Any", SimpleNamespace(machines=[])), history, random.Random(1))
+    assert await clients._change(cast("Any", Session(status)), "a", "DELETE", "http://m1/")
+    assert history.containers == {"a": Expected.GONE}
+    assert history.lost_containers == lost
+    assert len(history.violations([], 0)) == len(lost)
+
+
+def test_a_container_that_runs_twice_for_a_while_is_told() -> None:
+    history = History()
+    for running in (["a", "a"], ["a"], ["a", "b", "b"], ["a", "a", "b"]):  # one was just forked
+        history.saw_running(running)
+    assert history.violations([], 0) == []
+    for running in (["b", "b"], ["b", "b", "b"], ["b"]):
+        history.saw_running(running)
+    assert history.violations([], 0) == ["container b ran twice for a while"]
+
+
+def test_registers_are_read_since_a_time_by_answered_reads() -> None:
+    history = History()
+    history.read("x", 1, 3, 0)
+    history.wrote("y", 5, 6, 1, Fate.DONE)
+    assert history.read_since(1) == {"x"}
+    assert history.read_since(2) == set()
+    assert history.reads == 1
