@@ -59,8 +59,8 @@ class History:
         lost_containers: Containers that ran by the answers of the masters, and were not found when they were
             to be removed.
         doubled_containers: Containers that ran twice for a while.
-        cuts: Masters that were cut off, with start and end. TCP sends again what was on its way then, and
-            it arrives when the network is back; task sets refuse it by its term.
+        cuts: Masters whose packets to clients were held up, with start and end. TCP sends again what was on
+            its way then, and it arrives when the network is back; task sets refuse it by its term.
         stops: Masters that were stopped, and when they went on. One that is stopped between its look at the
             lease and the write sends that one message when it goes on; task sets refuse it by its term.
     """
@@ -212,7 +212,7 @@ class History:
                 yield f"{robot} was done {stored[robot]} times"
 
     def _is_late(self, heard: Heard) -> bool:
-        """Return whether a message may have been sent before its master was cut off.
+        """Return whether a message may have been sent before its master's packets were held up, or meanwhile.
 
         Pauses between two attempts of TCP double: the next one comes after at most the time that has passed.
         """

@@ -15,18 +15,30 @@ from pathlib import Path
 import aiohttp
 from support.engine import Program, command_line, engine_processes, until
 from support.stranger import Stranger, stranger, wire_echo
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from faults.history import Heard, History
 from faults.machines import CONTROL_PORT, PATIENCE_S, SECRET, Cluster, Machine
 from rce.control import decode_to_task_set, encode
-from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind, Welcome
+from rce.control.messages import (
+    CONTROL_VERSION,
+    ClientReply,
+    ClientRequest,
+    Hello,
+    MachineInfo,
+    TaskSetKind,
+    Welcome,
+)
 from tools.leaks import sweep_cgroups
 
 PING_S = 0.1
 DIAL_S = 0.3
 """Pause between two attempts to reach a master as a task set, and the time that it has for its answer."""
+ASK_S = 0.3
+"""Pause between two requests of a prober on a connection."""
+ANSWER = ClientReply.__name__
+"""What a prober hears from a master that leads, after each request."""
 LOOK_S = 1.0
 """Pause between two looks at the containers."""
 
@@ -34,7 +46,8 @@ LOOK_S = 1.0
 class Prober:
     """Says Hello to each master again and again, and believes all: so it hears all that act as leaders.
 
-    A connection is kept until the master ends it: a master that was stopped has it when it wakes.
+    A connection is kept until the master ends it: a master that was stopped has it when it wakes. It asks for
+    something all the time, so that a master that leads no more, and does not know it, has reasons to act.
     """
 
     def __init__(self, cluster: Cluster, history: History) -> None:
@@ -43,14 +56,21 @@ class Prober:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Do so until it is left."""
+        """Do so until it is left.
+
+        Raises:
+            Exception: A probe ended by it: what its master did then was not seen.
+        """
         tasks = [asyncio.create_task(self._probe(machine)) for machine in self._cluster.machines]
         try:
             yield
         finally:
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
 
     async def _probe(self, machine: Machine) -> None:
         while True:
@@ -64,13 +84,18 @@ class Prober:
         term = 0
         async with connect(url, additional_headers=headers, open_timeout=60, ping_interval=None) as socket:
             await socket.send(encode(_hello(machine.name)))
-            async for frame in socket:
-                message = decode_to_task_set(frame)
-                if isinstance(message, Welcome):
-                    term = message.term
-                if term:
-                    kind = type(message).__name__
-                    self._history.heard.append(Heard(time.monotonic(), machine.name, term, kind))
+            asking = asyncio.create_task(_ask(socket))
+            try:
+                async for frame in socket:
+                    message = decode_to_task_set(frame)
+                    if isinstance(message, Welcome):
+                        term = message.term
+                    if term:
+                        kind = type(message).__name__
+                        self._history.heard.append(Heard(time.monotonic(), machine.name, term, kind))
+            finally:
+                asking.cancel()
+                await asyncio.gather(asking, return_exceptions=True)
 
 
 def _hello(name: str) -> Hello:
@@ -78,6 +103,13 @@ def _hello(name: str) -> Hello:
     machine = MachineInfo(name=f"prober-{name}", slots=1, draining=True)
     kind = TaskSetKind.CONTAINER
     return Hello(version=CONTROL_VERSION, kind=kind, process=f"prober-{name}", machine=machine)
+
+
+async def _ask(socket: ClientConnection) -> None:
+    """Ask for a container of a robot that is not connected, which is refused at once, until cancelled."""
+    for number in itertools.count(1):
+        await asyncio.sleep(ASK_S)
+        await socket.send(encode(ClientRequest(request=number, id="prober/none", type="CC", data=None)))
 
 
 class Robot:

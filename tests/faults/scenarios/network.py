@@ -35,17 +35,29 @@ async def cut(world: World) -> None:
         (chain, "-p", "tcp", way, str(ETCD_PORT))
         for chain, way in (("OUTPUT", "--dport"), ("INPUT", "--sport"))
     ]
-    await _cut(world, "master cut off from etcd", lambda machine: dropped([machine.place], *from_etcd))
+    await _cut(
+        world,
+        "master cut off from etcd",
+        lambda machine: dropped([machine.place], *from_etcd),
+        from_clients=False,
+    )
 
 
-async def _cut(world: World, what: str, make: Callable[[Machine], AbstractContextManager[None]]) -> None:
+async def _cut(
+    world: World,
+    what: str,
+    make: Callable[[Machine], AbstractContextManager[None]],
+    *,
+    from_clients: bool = True,
+) -> None:
     leader = await world.cluster.leader()
     with make(leader):
         since = time.monotonic()
         end = await world.until_written(what, since)
         await world.until_task_sets_are_back(end)
         await asyncio.sleep(max(0.0, since + _seconds(world) - time.monotonic()))
-    world.history.cuts.append((leader.name, since, time.monotonic()))
+    if from_clients:
+        world.history.cuts.append((leader.name, since, time.monotonic()))
     await world.whole()
 
 
@@ -80,10 +92,12 @@ async def cut_etcd_apart(world: World) -> None:
 async def flap(world: World) -> None:
     """Pull the leading master's cable and put it back each second."""
     leader = await world.cluster.leader()
+    since = time.monotonic()
     for _ in range(round(_seconds(world) / 2)):
         with unplugged(leader.place):
             await asyncio.sleep(1.0)
         await asyncio.sleep(1.0)
+    world.history.cuts.append((leader.name, since, time.monotonic()))
     await world.until_written("flapping cable", time.monotonic())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 import random
@@ -15,6 +16,7 @@ from faults.clients import Clients
 from faults.goals import GOALS, Times
 from faults.history import Expected, Fate, Heard, History
 from faults.linearizability import Operation, is_linearizable, unexplained
+from faults.task_sets import Prober
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -271,3 +273,14 @@ def test_registers_are_read_since_a_time_by_answered_reads() -> None:
     assert history.read_since(1) == {"x"}
     assert history.read_since(2) == set()
     assert history.reads == 1
+
+
+async def test_a_prober_that_ends_early_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fail(*_: object) -> None:
+        raise ValueError("not a message")
+
+    monkeypatch.setattr(Prober, "_listen", fail)
+    prober = Prober(cast("Any", SimpleNamespace(machines=["m1"])), History())
+    with pytest.raises(ValueError, match="not a message"):
+        async with prober.running():
+            await asyncio.sleep(0)
