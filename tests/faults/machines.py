@@ -24,6 +24,8 @@ MASTERS = 3
 HTTP_PORT, CONTROL_PORT, PEER_PORT = 9000, 8080, 2380
 SECRET = "a secret for the tests"
 PATIENCE_S = 120.0
+REACH_S = 0.5
+"""How long a TCP connection may take over a network that is whole."""
 _CLONE_NEWNET = 0x40000000
 _ETCD_OPTIONS = (
     *("--max-txn-ops", "4096", "--max-request-bytes", "16777216", "--log-level", "error"),
@@ -212,6 +214,17 @@ async def fetch(url: str, *, post: bool = False) -> dict[str, Any]:
         ):
             return {**await reply.json(content_type=None), "code": reply.status}
     return {}
+
+
+async def is_reached(machine: Machine) -> bool:
+    """Return whether the HTTP server of a master can be reached."""
+    try:
+        async with asyncio.timeout(REACH_S):
+            _, writer = await asyncio.open_connection(machine.address, HTTP_PORT)
+    except OSError:  # a time-out is one
+        return False
+    writer.close()
+    return True
 
 
 @asynccontextmanager

@@ -19,6 +19,9 @@ from faults.history import Expected, History
 from faults.machines import PATIENCE_S, Cluster, Machine, cluster
 from faults.task_sets import ANSWER, Prober, Robot, running_containers, task_sets, watched_containers
 
+TASK_SETS = 2
+"""Real ones."""
+
 
 @dataclass
 class World:
@@ -67,12 +70,15 @@ class World:
             return
 
         async def back() -> bool:
-            found = await self.clients.machines()
-            real = [there for name, there in found.items() if not name.startswith("prober-")]
-            return len(real) == 2 and all(real)
+            return await self.connected_task_sets() == TASK_SETS
 
         await until(back, timeout=PATIENCE_S, what="all task sets are back")
         self.times.add("task sets are back", time.monotonic() - since)
+
+    async def connected_task_sets(self) -> int:
+        """Return how many real task sets are connected to the leading master."""
+        found = await self.clients.machines()
+        return sum(there for name, there in found.items() if not name.startswith("prober-"))
 
     async def until_no_master_leads(self) -> None:
         """Wait until no master says that it leads, and all say why."""
@@ -89,6 +95,30 @@ class World:
         since = time.monotonic()
         await self.clients.wait_for_writes(since=since)
         await self.clients.wait_for_reads(since)
+
+    async def term(self) -> int:
+        """Return the term of the leading master."""
+
+        async def told() -> int:
+            return int((await (await self.cluster.leader()).health()).get("term", 0))
+
+        return await until(told, timeout=PATIENCE_S, what="the leading master tells its term")
+
+    @asynccontextmanager
+    async def lead_stays(self, fault: str) -> AsyncIterator[None]:
+        """Check that no term begins meanwhile.
+
+        Args:
+            fault: What is done to the leading master.
+
+        Raises:
+            AssertionError: The lead was lost, though that fault must not take it.
+        """
+        before = await self.term()
+        yield
+        begun = await self.term() - before
+        self.times.add(f"terms begun under {fault}", begun)
+        assert begun == 0, f"{begun} terms have begun under {fault}"
 
     async def until_containers_are_right(self) -> None:
         """Wait until exactly the containers run that were acknowledged and not removed."""

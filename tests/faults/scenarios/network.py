@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, AsyncExitStack
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager
+
+from support.engine import until
 
 from faults.answers import losing_proxies
-from faults.machines import CONTROL_PORT, PEER_PORT, Machine
+from faults.machines import CONTROL_PORT, PATIENCE_S, PEER_PORT, Machine, is_reached
 from faults.networks import dropped, slow, unplugged
 from faults.world import World
 from rce.config.store_address import ETCD_PORT
@@ -54,6 +56,7 @@ async def _cut(
     with make(leader):
         since = time.monotonic()
         end = await world.until_written(what, since)
+        await world.cluster.leader(but=leader)
         await world.until_task_sets_are_back(end)
         await asyncio.sleep(max(0.0, since + _seconds(world) - time.monotonic()))
     if from_clients:
@@ -67,9 +70,14 @@ def _seconds(world: World) -> float:
 
 async def cut_from_task_sets(world: World) -> None:
     """Cut the leading master off from all task sets, which must stay as they are until they hear it again."""
+
+    async def none_is_connected() -> bool:
+        return await world.connected_task_sets() == 0
+
     leader = await world.cluster.leader()
     with dropped([leader.place], ("INPUT", "-p", "tcp", "--dport", str(CONTROL_PORT))):
         await asyncio.sleep(_seconds(world))
+        await until(none_is_connected, timeout=PATIENCE_S, what="the leading master misses all task sets")
         await world.clients.wait_for_writes()  # clients still reach it
     await world.until_task_sets_are_back(time.monotonic())
 
@@ -95,26 +103,43 @@ async def flap(world: World) -> None:
     since = time.monotonic()
     for _ in range(round(_seconds(world) / 2)):
         with unplugged(leader.place):
-            await asyncio.sleep(1.0)
+            reached, _ = await asyncio.gather(is_reached(leader), asyncio.sleep(1.0))
+            assert not reached, "the cable is not out"
         await asyncio.sleep(1.0)
     world.history.cuts.append((leader.name, since, time.monotonic()))
     await world.until_written("flapping cable", time.monotonic())
 
 
 async def delay(world: World) -> None:
-    """Delay and lose packets of one machine after the other; then of all."""
-    term = (await (await world.cluster.leader()).health())["term"]
+    """Delay and lose packets of one machine after the other, which moves no lead; then of all."""
+    fault = f"{DELAY_S * 1e3:g} ms and {LOSS:.0%}"
+    machines = world.cluster.machines
+    for machine in machines[:1] if world.scale == 1 else machines:
+        async with _delayed(world, machine), world.lead_stays(f"{fault} at one"):
+            await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
+            await world.clients.wait_for_writes()
+    if world.scale == 1:
+        return
     async with AsyncExitStack() as stack:
-        for number, machine in enumerate(
-            world.cluster.machines[:1] if world.scale == 1 else world.cluster.machines
-        ):
-            await stack.enter_async_context(
-                slow(machine.place, world.rng.randrange(1000), delay=DELAY_S, loss=LOSS, tag=str(number))
-            )
-        await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
+        for machine in machines:
+            await stack.enter_async_context(_delayed(world, machine))
+        term = await world.term()
+        await asyncio.sleep(LONG_SLOW_S)
         await world.clients.wait_for_writes()
-        now = (await (await world.cluster.leader()).health())["term"]
-        world.times.add(f"terms begun under {DELAY_S * 1e3:g} ms and {LOSS:.0%}", now - term)
+        world.times.add(f"terms begun under {fault} at all", await world.term() - term)
+
+
+@asynccontextmanager
+async def _delayed(world: World, machine: Machine) -> AsyncIterator[None]:
+    """Delay and lose packets of a machine until it is left."""
+    since = time.monotonic()
+    seed = world.rng.randrange(1000)
+    async with slow(machine.place, seed, delay=DELAY_S, loss=LOSS, tag=machine.name):
+        asked = time.monotonic()
+        await machine.health()
+        assert time.monotonic() - asked > 2 * DELAY_S, f"packets of {machine.name} are not delayed"
+        yield
+    world.history.cuts.append((machine.name, since, time.monotonic()))
 
 
 async def lose_answers(world: World) -> None:
