@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,24 @@ def data() -> Path:
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Return the value that ``share`` of the sorted values do not exceed (nearest rank)."""
+    """Return the smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
+    assert 0 <= share <= 1, f"{share} is not a share"
     ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+    rank = ceil(round(share * len(ordered), 9))  # 0.07 * 100 is a little more than 7
+    return ordered[max(rank, 1) - 1]
+
+
+def own_memory(name: str) -> float:
+    """Return the memory of this process in MB.
+
+    ``ru_maxrss`` does not tell it: that of a new program begins with the size of the process that started it.
+
+    Args:
+        name: ``VmRSS`` now, or ``VmHWM`` at most since the program began.
+    """
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    (kilobytes,) = (line.split()[1] for line in lines if line.startswith(f"{name}:"))
+    return int(kilobytes) * 1024 / 1e6
 
 
 def spread(seconds: Sequence[float]) -> dict[str, float]:

@@ -13,13 +13,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field
 from random import Random
-from resource import RUSAGE_SELF, getrusage
 from time import thread_time
 from typing import Any, Self, assert_never
 
 import numpy as np
 
-from benchmarks.figures import save, show
+from benchmarks.figures import own_memory, save, show
 from rce_fleet.coordination.events import (
     BlockedChanged,
     Event,
@@ -65,7 +64,7 @@ def make_robots(world: NamedWorld, count: int) -> LightRobots:
 def measure_world(count: int, seconds: float) -> dict[str, Any]:
     """Measure robots that drive to and fro between neighbouring cells."""
     world = warehouse()
-    before = getrusage(RUSAGE_SELF).ru_maxrss
+    before = own_memory("VmRSS")
     robots = make_robots(world, count)
     offsets = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
     began = thread_time()
@@ -80,7 +79,7 @@ def measure_world(count: int, seconds: float) -> dict[str, Any]:
         "robots": count,
         "ms per simulated s": round(1000 * spent / seconds, 2),
         "us per robot and s": round(1e6 * spent / seconds / count, 1),
-        "MB more": round((getrusage(RUSAGE_SELF).ru_maxrss - before) / 1024, 1),
+        "MB more": round(own_memory("VmRSS") - before, 1),
         "x real time": round(seconds / spent, 1),
         "target": TARGET if count == SIZES[-1] else "",
     }

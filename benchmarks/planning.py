@@ -12,13 +12,12 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from resource import RUSAGE_SELF, getrusage
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import data, save, show
+from benchmarks.figures import data, own_memory, save, show
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.fields import distance_fields
@@ -120,7 +119,7 @@ def large(robots: int, times: int) -> dict[str, Any]:
     problem = PlanningProblem.of(graph, starts, goals, effort=4000 * robots, rotations=True)
     joint = planner.plan(problem)
     took = perf_counter() - began
-    peak = getrusage(RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    peak = own_memory("VmHWM") / 1e3
     if not joint.complete:
         raise RuntimeError(f"{robots} robots: no plan was found in {took:.1f} s")
     if faults := check_plan(grid, [joint.path(robot) for robot in range(robots)], starts=starts, goals=goals):
