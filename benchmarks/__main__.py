@@ -28,7 +28,7 @@ from benchmarks import (
     tls,
 )
 from benchmarks.engine import RunningEngine, engine
-from benchmarks.figures import plot_round_trips, save, show
+from benchmarks.figures import Results, plot_round_trips, show
 from benchmarks.targets import RATIOS
 
 Rows = list[dict[str, Any]]
@@ -39,7 +39,7 @@ OTHERS = {
     "robots": (
         ("localization", "--only", "update"),
         ("navigation", "--only", "plan"),
-        ("simulation", "--quick"),
+        ("simulation",),
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
     "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("batches",), ("planning",)),
@@ -47,6 +47,8 @@ OTHERS = {
 }
 """Other programs by part; each prints and saves its own figures. :data:`WITHOUT_ENGINE` need no engine."""
 WITHOUT_ENGINE = ("fleet", "scale")
+ALWAYS_SHORT = ("mapping",)
+"""Programs without an option ``--quick``."""
 
 
 def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
@@ -101,18 +103,20 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
 
 
 async def measure_engine(
-    chosen: dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]], runtime: str
+    chosen: dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]], runtime: str, *, quick: bool
 ) -> None:
     """Run suites on one engine."""
-    results: dict[str, Rows] = {}
+    results = Results("engine", quick=quick or runtime == "process")
     async with engine(runtime) as running:
         for name, (title, suite) in chosen.items():
+            results.begin(name)
             rows = await suite(running)
             show(title, rows)
-            results[name] = rows
+            results.keep(name, rows)
+            path = results.save()  # what was measured stays if a later suite fails
             if name == "roundtrip":
                 print("plot:", plot_round_trips(rows))
-    print("results:", save("engine", results))
+    print("results:", path)
 
 
 async def measure(names: list[str], *, quick: bool, runtime: str) -> int:
@@ -122,10 +126,10 @@ async def measure(names: list[str], *, quick: bool, runtime: str) -> int:
     parts = names or [*chosen, *WITHOUT_ENGINE]
     of_engine = [name for name in parts if name in chosen]
     if of_engine:
-        await measure_engine({name: chosen[name] for name in of_engine}, runtime)
+        await measure_engine({name: chosen[name] for name in of_engine}, runtime, quick=quick)
     for part in parts:
         for program, *options in OTHERS.get(part, ()):
-            short = ["--quick"] if quick and part in WITHOUT_ENGINE else []
+            short = ["--quick"] if quick and program not in ALWAYS_SHORT else []
             argv = [sys.executable, "-m", f"benchmarks.{program}", *options, *short]
             other = await asyncio.create_subprocess_exec(*argv, cwd=ROOT)
             if await other.wait():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from benchmarks.traffic import warehouse
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
@@ -85,9 +85,11 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="100 robots only")
     options = parser.parse_args()
     compile_kernels([*MATCHING_KERNELS, measure_ways])
+    results = Results("assignment", quick=options.quick)
     rows = [measure(count) for count in ((100,) if options.quick else (100, 1000))]
     show("Tasks for idle robots", rows)
-    print("results:", save("assignment", {"choose": rows}))
+    results.keep("choose", rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import data, save, show
+from benchmarks.figures import Results, data, show
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.nodes.batch_worker import SEARCH_S
 from rce_fleet.planning.movingai import read_map
@@ -118,6 +118,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one small fleet")
     options = parser.parse_args()
     compile_kernels([*MATCHING_KERNELS, measure_ways])
+    results = Results("batches", quick=options.quick)
     rows = []
     for robots, deliveries in FLEETS[:1] if options.quick else FLEETS:
         for batches in (False, True):
@@ -131,7 +132,8 @@ def main() -> None:
             row["making one, most ms"] = round(1e3 * max(run.longest for run in runs), 1)
             rows.append(row)
     show(f"Deliveries done with and without better queues, means of {len(SEEDS)} seeds", rows)
-    print("results:", save("batches", {"queues": rows}))
+    results.keep("queues", rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

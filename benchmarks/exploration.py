@@ -2,7 +2,8 @@
 
 A TurtleBot with a lidar explores the demo's floor from the starts of seeds 1, 2, ...: frontiers, the parts of
 ``move_base`` and of the safety stage, and a mapper, in simulated time and with the parameters of
-``configs/turtlebot``. The map is compared with the true walls.
+``configs/turtlebot``. The map is compared with the true walls. Results with one mapper only, or with another
+sensor, are not saved.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 import yaml
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.drivers.scene import load_scene
 from rce_fleet.drivers.scene_items import RobotStart
@@ -47,6 +48,7 @@ Rows = list[dict[str, Any]]
 
 FOLDER = Path(__file__).parent.parent / "configs"
 RUNS, QUICK_RUNS = 10, 2
+ALGORITHMS = ("gmapping", "graph")
 TICK = 0.02
 SAFETY_EVERY, CONTROL_EVERY, GLOBAL_EVERY = 2, 5, 25
 """In ticks: 25 Hz safety, 10 Hz control and scans, 2 Hz global costmap and frontiers."""
@@ -310,19 +312,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.exploration", description=__doc__)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_RUNS} runs")
     parser.add_argument("--runs", type=int, default=RUNS, help="how many starts")
-    parser.add_argument(
-        "--with", dest="algorithms", nargs="+", choices=("gmapping", "graph"), default=["gmapping", "graph"]
-    )
+    parser.add_argument("--with", dest="algorithms", nargs="+", choices=ALGORITHMS, default=ALGORITHMS)
     parser.add_argument("--sensor", default="lidar", choices=("lidar", "depth_camera"))
     options = parser.parse_args()
     compile_kernels()
     runs = QUICK_RUNS if options.quick else options.runs
+    results = Results("exploration", quick=runs < RUNS)
     rows = [row for name in options.algorithms for row in measure(runs, name, options.sensor)]
     show(
         "Exploration of the demo's floor",
         [*rows, {key: TARGETS.get(key, "") for key in rows[0]} | {"with": "target"}],
     )
-    print("results:", save("exploration", {"exploration": rows}))
+    if options.sensor == "lidar" and set(options.algorithms) == set(ALGORITHMS):
+        results.keep("exploration", rows)
+        print("results:", results.save())
 
 
 if __name__ == "__main__":

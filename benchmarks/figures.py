@@ -107,12 +107,47 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     Console(width=120).print(table)
 
 
-def save(name: str, results: Mapping[str, Any]) -> Path:
-    """Write results as JSON."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps({"machine": machine(), **results}, indent=1) + "\n")
-    return path
+class Results:
+    """What a program measures: rows by suite, each with the machine as it was when the suite began.
+
+    Args:
+        name: Of the file.
+        quick: Whether less is measured than what the performance page shows, which does not take it then.
+    """
+
+    def __init__(self, name: str, *, quick: bool = False) -> None:
+        self._name, self._quick = name, quick
+        self._machine = machine()
+        self._began: dict[str, dict[str, Any]] = {}
+        self._is_quick: dict[str, bool] = {}
+        self._rows: dict[str, Sequence[Any]] = {}
+
+    def begin(self, *suites: str) -> None:
+        """Note the machine as suites begin; without a call it is as the program began."""
+        self._began |= dict.fromkeys(suites, machine())
+
+    def keep(self, suite: str, rows: Sequence[Any], *, unfinished: bool = False) -> None:
+        """Take the rows of a suite.
+
+        Args:
+            suite: Its name.
+            rows: Its rows, in the place of earlier ones.
+            unfinished: Whether more runs follow, so that the page does not take these rows.
+        """
+        self._rows[suite] = rows
+        self._is_quick[suite] = self._quick or unfinished
+
+    def save(self) -> Path:
+        """Write everything as JSON; return the file."""
+        machines = {
+            suite: self._began.get(suite, self._machine) | ({"quick": True} if is_quick else {})
+            for suite, is_quick in self._is_quick.items()
+        }
+        RESULTS.mkdir(exist_ok=True)
+        path = RESULTS / f"{self._name}.json"
+        text = json.dumps({"machine": self._machine, "machines": machines, **self._rows}, indent=1)
+        path.write_text(text + "\n", encoding="utf-8")
+        return path
 
 
 def plot_round_trips(rows: Sequence[Mapping[str, Any]]) -> Path:

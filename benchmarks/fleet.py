@@ -22,8 +22,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks.figures import percentile, save, show
-from benchmarks.summary import main as summarize
+from benchmarks.figures import Results, percentile, show
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Time, TypeRegistry
 from rce_fleet.coordination.events import (
@@ -312,9 +311,7 @@ async def measure(*, quick: bool) -> None:
     show("Event loop while a plan is made", plans)
     rates = [await byte_rates(count, seconds=5 if quick else 10) for count in sizes[:3]]
     show("Bytes a second while robots drive", rates)
-    print("results:", save("fleet", {"planner": poses, "planning": plans, "bytes": rates}))
-    if not quick:
-        summarize()
+    print("results:", results.save())
 
 
 def main() -> None:
@@ -326,3 +323,9 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    results = Results("fleet", quick=quick)
+    results.keep("planner", poses)
+    results.begin("planning")
+    results.keep("planning", plans)
+    results.begin("bytes")
+    results.keep("bytes", rates)

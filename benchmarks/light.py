@@ -18,7 +18,7 @@ from typing import Any, Self, assert_never
 
 import numpy as np
 
-from benchmarks.figures import own_memory, save, show
+from benchmarks.figures import Results, own_memory, show
 from rce_fleet.coordination.events import (
     BlockedChanged,
     Event,
@@ -236,11 +236,16 @@ def main() -> None:
     options = parser.parse_args()
     seconds = 10.0 if options.quick else 60.0
     sizes = options.robots or ((10, 100) if options.quick else SIZES)
-    results: dict[str, Rows] = {"world": [measure_world(count, seconds) for count in SIZES]}
-    show("Light robots", results["world"])
-    results["fleet"] = [measure_fleet(count, seconds) for count in sizes]
-    show("Light robots with planner and move clients", results["fleet"])
-    print("results:", save("light", results))
+    results = Results("light", quick=options.quick or bool(options.robots))
+    measure_world(SIZES[0], 1.0)  # loads modules, whose time and memory are not the robots'
+    world = [measure_world(count, seconds) for count in SIZES]
+    results.keep("world", world)
+    show("Light robots", world)
+    results.begin("fleet")
+    fleet = [measure_fleet(count, seconds) for count in sizes]
+    results.keep("fleet", fleet)
+    show("Light robots with planner and move clients", fleet)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.geometry.poses import Pose, relative
 from rce_fleet.localization.replay import replay
@@ -194,7 +194,9 @@ def plot(name: str, maps: dict[str, OccupancyMap], folder: Path) -> Path:
 def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mapping", description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=LOGS, default=LOGS, metavar="LOG")
+    parser.add_argument(
+        "--only", nargs="+", choices=LOGS, default=LOGS, metavar="LOG", help="saves nothing unless it is all"
+    )
     parser.add_argument("--scans", type=int, help="only the first scans of each log; saves nothing")
     parser.add_argument("--figures", type=Path, help="folder for pictures of the maps")
     parser.add_argument(
@@ -208,6 +210,7 @@ def main() -> None:
         split = [measure_split(name, options.split, options.scans) for name in options.only]
         show(f"Mapping with {options.split} robots", split)
         return
+    results = Results("mapping")
     rows: list[Row] = []
     for name in options.only:
         found, maps = measure(name, options.scans)
@@ -215,8 +218,10 @@ def main() -> None:
         show(f"Mapping of {name}", with_targets(found))
         if options.figures:
             print("picture:", plot(name, maps, options.figures))
-    if options.scans is None:  # scores of a part say nothing about a log
-        print("results:", save("mapping", {"mapping": rows}))
+    # Scores of a part say nothing about a log, and rows of one log would replace those of all.
+    if options.scans is None and set(options.only) == set(LOGS):
+        results.keep("mapping", rows)
+        print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import data, own_memory, save, show
+from benchmarks.figures import Results, data, own_memory, show
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.fields import distance_fields
@@ -210,12 +210,14 @@ def measure(names: list[str], *, quick: bool) -> None:
         ),
         "large": ("Very many robots", lambda: in_own_process(*((2000, 2) if quick else (10_000, 3)))),
     }
-    results = {}
+    results = Results("planning", quick=quick)
     for name in names or SUITES:
         title, run = suites[name]
-        results[name] = run()
-        show(title, results[name])
-    print("results:", save("planning", results))
+        results.begin(name)
+        rows = run()
+        show(title, rows)
+        results.keep(name, rows)
+    print("results:", results.save())
 
 
 def main() -> None:

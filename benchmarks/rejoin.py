@@ -21,7 +21,7 @@ import msgspec
 import psutil
 import uvloop
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from rce.control import EndpointKind, EndpointSpec
 from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec
 from rce.link import Endpoint, Interface, LinkHub
@@ -271,9 +271,11 @@ def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rejoin", description=__doc__)
     parser.add_argument("--robots", type=int, nargs="+", default=[100, 1000], help="numbers of robots")
+    results = Results("rejoin")
     rows = [uvloop.run(measure(robots)) for robots in parser.parse_args().robots]
     show("A planner's container that is made again", rows)
-    print("results:", save("rejoin", {"rejoin": rows}))
+    results.keep("rejoin", rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import tracemalloc
 from time import thread_time
 from typing import Any
 
-from benchmarks.figures import percentile, save, show
+from benchmarks.figures import Results, percentile, show
 from benchmarks.targets import beside_targets
 from rce.control import CONTROL_VERSION, EndpointStatus, Hello, MachineInfo, TaskSetKind
 from rce.model import InterfaceSpec, NodeSpec, Resources
@@ -173,13 +173,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="10 and 100 machines only")
     options = parser.parse_args()
+    results = Results("scale", quick=options.quick)
     measured = [measure(machines) for machines in (SIZES[:2] if options.quick else SIZES)]
     suites = {name: [rows[name] for rows in measured] for name in ("placing", "store")}
+    for name, rows in suites.items():
+        results.keep(name, rows)
     show("Placing, processor time", suites["placing"])
     show("The store, and the state that is loaded from it", suites["store"])
     if not options.quick:
         show("Beside the targets", list(beside_targets("scale", suites)))
-    print("results:", save("scale", suites))
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

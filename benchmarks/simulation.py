@@ -17,7 +17,7 @@ from typing import Any
 
 import uvloop
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import TypeRegistry
@@ -138,11 +138,15 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer passes")
     options = parser.parse_args()
     passes = 2 if options.quick else 5
+    results = Results("simulation", quick=options.quick)
     world = measure_world(passes)
+    results.keep("world", world)
     show("Simulated world, a core's seconds for a simulated second", world)
+    results.begin("nodes")
     nodes = uvloop.run(measure_nodes(passes))
+    results.keep("nodes", nodes)
     show("The same with ROS nodes", nodes)
-    print("results:", save("simulation", {"world": world, "nodes": nodes}))
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 import uvloop
 
 from benchmarks.engine import RunningEngine, engine, words
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from benchmarks.wire import Robot, robot, serialized_string, wire_echo
 from tools.leaks import Traces, footprint
 
@@ -120,7 +120,7 @@ def find(running: RunningEngine, module: str) -> int:
 
 async def soak(count: int, runtime: str) -> list[str]:
     """Run it; return a text about the remains."""
-    rows = []
+    results, rows = Results("soak"), []
     async with engine(runtime) as running, AsyncExitStack() as stack:
         workers = [await stack.enter_async_context(robot(running.url, f"worker{n}")) for n in range(WORKERS)]
         await live(workers[0], "warm")
@@ -137,12 +137,15 @@ async def soak(count: int, runtime: str) -> list[str]:
         [{k: v for k, v in row.items() if "fds" not in k} for row in rows],
     )
     if count >= WORTH_KEEPING:
-        print("results:", save("soak", {"soak": rows, "left": left}))
+        results.keep("soak", rows)
+        results.keep("left", left)
+        print("results:", results.save())
     return left
 
 
 async def flood(megabytes: int, runtime: str) -> list[str]:
     """Have a node flood its log; return a text about the faults."""
+    results = Results("flood")
     async with engine(runtime) as running, robot(running.url, "flooder") as client:
         await wire_echo(client, "Forwarder", "flooded")
         environment = find(running, "rce_container.environment")
@@ -158,7 +161,8 @@ async def flood(megabytes: int, runtime: str) -> list[str]:
         await client.receive_binary()
         rows.append({"when": f"after {megabytes} MB in {seconds:.0f} s", **weigh(running, pids)})
     show("A node floods its standard output", rows)
-    print("results:", save("flood", {"flood": rows}))
+    results.keep("flood", rows)
+    print("results:", results.save())
     before, after = rows
     return [
         f"{name} grew from {before[name]} to {after[name]}"

@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 
 from benchmarks.engine import BIN, free_ports, pss
-from benchmarks.figures import percentile, save, show
+from benchmarks.figures import Results, percentile, show
 from benchmarks.targets import beside_targets
 from rce.supervision.process import Child
 from rce_master.exceptions import StoreError
@@ -155,11 +155,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.store", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer saves and seconds")
     options = parser.parse_args()
+    results = Results("store", quick=options.quick)
     suites = asyncio.run(measure(quick=options.quick))
     show("A save in etcd, three members", suites["save"])
     show("One member of etcd beside idle masters", suites["idle"])
     show("Beside the targets", list(beside_targets("store", suites)))
-    print("results:", save("store", suites))
+    for name, rows in suites.items():
+        results.keep(name, rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Keeps the newest result of each suite in ``benchmarks/summary.json``: ``python -m benchmarks.summary``.
 
 Raw results are in ``benchmarks/results/`` and belong to a machine; the summary is committed, and the
-performance page is made from it (``python -m benchmarks.page``). A suite that was not measured again keeps
-its result.
+performance page is made from it (``python -m benchmarks.page``). A suite that was not measured again, or
+only in a quick or unfinished run, keeps its result.
 """
 
 from __future__ import annotations
@@ -18,20 +18,27 @@ _OF_ENGINE = "engine"
 
 
 def merged(summary: dict[str, Any], name: str, results: dict[str, Any]) -> dict[str, Any]:
-    """Return a summary with the suites of a file of results in the place of older ones.
+    """Return a summary with the suites of a file of results in the place of older ones; quick ones are left.
 
     Args:
         summary: Suite to its commit, machine and rows.
         name: Of the file; suites of others than the engine's get it before their own.
-        results: What :func:`benchmarks.figures.save` wrote.
+        results: What :meth:`benchmarks.figures.Results.save` wrote.
     """
-    machine = results["machine"]
+    machines = results.get("machines", {})
     new = {
-        suite if name == _OF_ENGINE else f"{name}.{suite}": {"machine": machine, "rows": rows}
+        suite if name == _OF_ENGINE else f"{name}.{suite}": {
+            "machine": machines.get(suite, results["machine"]),
+            "rows": rows,
+        }
         for suite, rows in results.items()
-        if suite != "machine" and isinstance(rows, list)
+        if isinstance(rows, list)
     }
-    newer = {suite: entry for suite, entry in new.items() if _date(entry) >= _date(summary.get(suite))}
+    newer = {
+        suite: entry
+        for suite, entry in new.items()
+        if not entry["machine"].get("quick") and _date(entry) >= _date(summary.get(suite))
+    }
     return dict(sorted((summary | newer).items()))
 
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from benchmarks.figures import data, save, show
+from benchmarks.figures import Results, data, show
 from benchmarks.light import Fleet
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.coordination.replanning import PlanRequest
@@ -66,6 +66,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=100, help="size of the fleet")
     options = parser.parse_args()
     compile_kernels()
+    results = Results("throughput", quick=options.quick)
     seconds, seeds = (60.0, (1,)) if options.quick else (300.0, (1, 2, 3))
     rows: list[dict[str, Any]] = []
     for name, settings in CHOICES.items():
@@ -73,7 +74,8 @@ def main() -> None:
         per_hour = sum(goals) * 3600 / (seconds * len(seeds))
         rows.append({"settings": name, "robots": options.robots, "goals": goals, "per hour": round(per_hour)})
     show(f"Goals that robots reach in {seconds:.0f} s, by seed", rows)
-    print("results:", save("throughput", {"goals": rows}))
+    results.keep("goals", rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

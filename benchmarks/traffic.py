@@ -20,7 +20,7 @@ from random import Random
 from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.figures import data, percentile, save, show
+from benchmarks.figures import Results, data, percentile, show
 from benchmarks.fleet import Fleet
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Time, TypeRegistry
@@ -33,7 +33,7 @@ from rce_fleet.coordination.settings import COMPILED_EFFORT, FleetSettings
 from rce_fleet.nodes.robot_messages import read_pose_seen
 from rce_fleet.nodes.state_publisher import changes_fields
 from rce_fleet.planning.movingai import read_map
-from rce_fleet.planning.planner import load_planner
+from rce_fleet.planning.planner import DEFAULT_PLANNER, load_planner
 from rce_fleet.planning.rerouting import REROUTING_KERNELS
 
 if TYPE_CHECKING:
@@ -247,6 +247,7 @@ def memory(count: int, planner: str) -> dict[str, Any]:
 
 def measure(*, quick: bool, planner: str) -> None:
     """Run all suites."""
+    results = Results("traffic", quick=quick)
     sizes = (10, 50) if quick else (10, 100, 1000)
     ticks, blocks = [], []
     for count in sizes:
@@ -255,16 +256,22 @@ def measure(*, quick: bool, planner: str) -> None:
         blocks += block_times(traffic, count, 5 if quick else 20)
     show(f"Tick of the planner node, planner {planner}", ticks)
     show("From a blocked cell to the last new path, without waits for tick and process", blocks)
+    results.begin("memory")
     sizes_of = [memory(count, planner) for count in sizes[:2]]
     show("Memory of the planner", sizes_of)
-    print("results:", save("traffic", {"tick": ticks, "block": blocks, "memory": sizes_of}))
+    if planner == DEFAULT_PLANNER:
+        for name, rows in (("tick", ticks), ("block", blocks), ("memory", sizes_of)):
+            results.keep(name, rows)
+        print("results:", results.save())
 
 
 def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.traffic", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small fleets only")
-    parser.add_argument("--planner", default="lacam", help="planner to measure with")
+    parser.add_argument(
+        "--planner", default=DEFAULT_PLANNER, help="planner to measure with; results of others are not saved"
+    )
     options = parser.parse_args()
     measure(quick=options.quick, planner=options.planner)
 

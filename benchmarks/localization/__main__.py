@@ -3,7 +3,8 @@
 ``update``: CPU time of an update (500 particles, 60 beams), numpy and compiled. ``lidar`` and ``camera``:
 accuracy from a first pose on. ``global``: from anywhere on the map. ``kidnapped``: after the robot was put
 somewhere else. Robot and world are the simulation's, the floor is the demo's; one box in ten is on no map.
-Results are saved after every ten runs, so that a measurement that is stopped keeps them.
+Results are saved after every ten runs, so that a measurement that is stopped keeps them; the performance
+page takes those of all runs only.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import save, show
+from benchmarks.figures import Results, show
 from benchmarks.floor import Floor
 from benchmarks.localization.runs import (
     KIDNAPPED_AT,
@@ -171,13 +172,17 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=suites(1), default=[], metavar="NAME")
     options = parser.parse_args()
     runs = options.runs or (QUICK_RUNS if options.quick else RUNS)
-    results: dict[str, Rows] = {}
+    results = Results("localization", quick=runs < RUNS)
     for name, (title, suite) in suites(runs).items():
         if not options.only or name in options.only:
-            for results[name] in suite():
-                path = save("localization", results)
-            show(title, results[name])
-    print("results:", path)
+            results.begin(name)
+            rows: Rows = []
+            for rows in suite():
+                results.keep(name, rows, unfinished=True)
+                results.save()
+            results.keep(name, rows)
+            show(title, rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Measure navigation: ``python -m benchmarks.navigation [--quick] [--runs N] [--only NAME ...]``.
 
 ``drive``: seeded runs on the demo's floor in the simulation, with localization, ``move_base`` and safety
-stage, among walkers and boxes of which some are on no map, against the targets; saved after every ten runs.
+stage, among walkers and boxes of which some are on no map, against the targets; saved after every ten runs,
+of which the performance page takes none before all are made.
 ``sampling``: the same runs with the two ways to choose trajectories, by time and smoothness. ``plan``: a plan
 on a costmap of 400 x 400 cells, compiled and in numpy.
 """
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import percentile, save, show
+from benchmarks.figures import Results, percentile, show
 from benchmarks.navigation.drive import RunResult, run
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.geometry.poses import Pose
@@ -133,14 +134,18 @@ def main() -> None:
     options = parser.parse_args()
     compile_kernels()
     chosen = suites(quick=options.quick, runs=QUICK_RUNS if options.quick else options.runs)
-    results: dict[str, Rows] = {}
+    results = Results("navigation", quick=options.quick or options.runs < RUNS)
     for name in options.only or chosen:
         title, suite = chosen[name]
+        results.begin(name)
+        shown: Rows = []
         for rows in suite():
-            results[name] = rows if name == "plan" else with_targets(rows)
-            path = save("navigation", results)
-        show(title, results[name])
-    print("results:", path)
+            shown = rows if name == "plan" else with_targets(rows)
+            results.keep(name, shown, unfinished=True)
+            results.save()
+        results.keep(name, shown)
+        show(title, shown)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import uvloop
 
-from benchmarks.figures import RESULTS, plot_round_trips, save, show
+from benchmarks.figures import RESULTS, Results, plot_round_trips, show
 from benchmarks.ros import suites
 from benchmarks.ros.sides import sides
 from benchmarks.ros.tools import tools
@@ -42,7 +42,7 @@ def measure(names: list[str], *, quick: bool, scratch: Path) -> None:
     found = sides(scratch)
     print("measured:", ", ".join(side.name for side in found))
     seconds = 2.0 if quick else 5.0
-    results: dict[str, suites.Rows] = {}
+    results = Results("ros", quick=quick)
     with our_master(PORT) as uri, suites.real_master(PORT + 1) as other:
         masters = {"ours": uri} | ({"rosmaster": other} if other else {})
         chosen: dict[str, tuple[str, Callable[[], suites.Rows]]] = {
@@ -72,12 +72,13 @@ def measure(names: list[str], *, quick: bool, scratch: Path) -> None:
         }
         for name in names or chosen:
             title, suite = chosen[name]
-            rows = results[name] = suite()
+            results.begin(name)
+            rows = suite()
             show(title, rows)
-    if "echo" in results:
-        plot = plot_round_trips(results["echo"])
-        print("plot:", shutil.move(plot, RESULTS / "ros.svg"))
-    print("results:", save("ros", results))
+            results.keep(name, rows)
+            if name == "echo":
+                print("plot:", shutil.move(plot_round_trips(rows), RESULTS / "ros.svg"))
+    print("results:", results.save())
 
 
 def main() -> None:

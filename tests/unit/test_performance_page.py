@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 
 from benchmarks.page import block, made
+from benchmarks import exploration, figures, mapping, traffic
+from benchmarks.figures import Results
 from benchmarks.summary import merged
 from benchmarks.targets import TARGETS
 
@@ -45,6 +47,87 @@ def test_newest_result_of_each_suite_is_kept() -> None:
 
 
 @pytest.mark.parametrize(
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where results are saved."""
+    monkeypatch.setattr(figures, "RESULTS", tmp_path)
+    return tmp_path
+
+
+def summary_of(results: Results) -> dict[str, Any]:
+    path = results.save()
+    return merged({}, path.stem, json.loads(path.read_text(encoding="utf-8")))
+
+
+def test_quick_and_unfinished_runs_are_left_out(folder: Path) -> None:
+    quick = Results("exploration", quick=True)
+    quick.keep("exploration", [{"runs": 2}])
+    assert summary_of(quick) == {}
+    results = Results("localization")
+    results.keep("update", [{"form": "numpy"}])
+    results.keep("lidar", [{"runs": 10}], unfinished=True)
+    assert set(summary_of(results)) == {"localization.update"}
+    results.keep("lidar", [{"runs": 100}])
+    assert summary_of(results)["localization.lidar"]["rows"] == [{"runs": 100}]
+
+
+def test_a_suite_has_the_load_of_its_start(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loads = iter((0.1, 0.2, 0.3))
+    monkeypatch.setattr(figures, "machine", lambda: machine("2026-01-01") | {"load_1min": next(loads)})
+    results = Results("light")
+    results.keep("world", [])
+    results.begin("fleet")
+    results.keep("fleet", [])
+    found = summary_of(results)
+    assert [found[f"light.{name}"]["machine"]["load_1min"] for name in ("world", "fleet")] == [0.1, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("options", "saved"),
+    [
+        ([], True),
+        (["--with", "graph", "gmapping"], True),
+        (["--with", "graph"], False),
+        (["--sensor", "depth_camera"], False),
+    ],
+)
+def test_partial_explorations_are_not_saved(
+    options: list[str], saved: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exploration, "compile_kernels", lambda: True)
+    monkeypatch.setattr(exploration, "measure", lambda runs, name, _: [{"with": name, "runs": runs}])
+    monkeypatch.setattr(sys, "argv", ["exploration", *options])
+    exploration.main()
+    assert (folder / "exploration.json").exists() == saved
+
+
+@pytest.mark.parametrize(
+    ("options", "saved"), [([], True), (["--only", "intel"], False), (["--scans", "9"], False)]
+)
+def test_partial_mappings_are_not_saved(
+    options: list[str], saved: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RCE_DATA", str(folder))
+    monkeypatch.setattr(mapping, "compile_kernels", lambda: True)
+    monkeypatch.setattr(mapping, "measure", lambda name, _: ([{"log": name}], {}))
+    monkeypatch.setattr(sys, "argv", ["mapping", *options])
+    mapping.main()
+    assert (folder / "mapping.json").exists() == saved
+
+
+@pytest.mark.parametrize(("options", "saved"), [([], True), (["--planner", "dijkstra"], False)])
+def test_traffic_of_another_planner_is_not_saved(
+    options: list[str], saved: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(traffic, "Traffic", lambda *_: None)
+    monkeypatch.setattr(traffic, "tick_times", lambda *_: {"robots": 10})
+    monkeypatch.setattr(traffic, "block_times", lambda *_: [{"robots": 10}])
+    monkeypatch.setattr(traffic, "memory", lambda *_: {"robots": 10})
+    monkeypatch.setattr(sys, "argv", ["traffic", *options])
+    traffic.main()
+    assert (folder / "traffic.json").exists() == saved
+
+
     ("figure", "line"),
     [
         (249.5, "| 249.5 ms | ≤ 250 ms | met |"),
