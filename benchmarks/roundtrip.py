@@ -111,8 +111,10 @@ async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = S
         await wire_echo(single, "Forwarder", "benchSingle")
         await wire_echo(converting, "Converter", "benchConverter")
 
+        payloads = {size: b"x" * size for size in sizes}
+
         async def bare_trip(size: int) -> None:
-            await bare.send(b"x" * size)
+            await bare.send(payloads[size])
             await bare.recv()
 
         trips = {

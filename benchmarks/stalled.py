@@ -71,6 +71,6 @@ async def _phase(
         "bytes": SIZE,
         "sent Hz": round(sent / seconds, 1),
         "healthy client Hz": round(received / seconds, 1),
-        "share %": round(100 * received / sent, 1),
+        "share %": round(100 * received / (RATE_HZ * seconds), 1),
         "rce-robot PSS MB": round(sum(map(pss, running.named("rce_robot"))) / 1e6, 1),
     }

@@ -1,4 +1,7 @@
-"""The cost of TLS on the robot's connection: round trips to a node with and without it, in turn."""
+"""The cost of TLS on the robot's connection: round trips to a node with and without it, in turn.
+
+Both robot endpoints are started for it: the engine's own one has grown with the suites before.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from benchmarks.engine import BIN, RunningEngine, cpu_seconds, free_ports
 from benchmarks.figures import percentile
 from benchmarks.roundtrip import Trip, converter_trip, forwarder_trip
 from benchmarks.targets import TLS_RATIO
-from benchmarks.wire import locate, robot_at, wire_echo
+from benchmarks.wire import robot_at, wire_echo
 from rce.supervision.process import Child
 from rce.tls.folder import CertificateFolder
 
@@ -29,23 +32,29 @@ Figures = dict[tuple[str, int, str], list[float]]
 _TRIPS = {"Converter": converter_trip, "Forwarder": forwarder_trip}
 
 
-@contextlib.asynccontextmanager
-async def tls_endpoint(
-    running: RunningEngine,
-) -> AsyncIterator[tuple[str, ssl.SSLContext, psutil.Process]]:
-    """Run another robot endpoint of the engine, whose robots connect in TLS.
-
-    Yields:
-        Its URL, a TLS context that trusts it, and its process.
-    """
+def make_certificates(running: RunningEngine) -> CertificateFolder:
+    """Make an authority, and a certificate of it for an endpoint."""
     certificates = CertificateFolder(running.folder / "bench-certificates")
     certificates.make_authority()
     certificates.issue("endpoint", ("127.0.0.1",))
+    return certificates
+
+
+@contextlib.asynccontextmanager
+async def endpoint(
+    running: RunningEngine, certificates: CertificateFolder | None = None
+) -> AsyncIterator[tuple[str, psutil.Process]]:
+    """Run another robot endpoint of the engine, whose robots connect in TLS if it has certificates.
+
+    Yields:
+        Its URL and its process.
+    """
     (port,) = free_ports(1)
     argv = [str(BIN / "rce-robot"), "127.0.0.1", "--dev", "--control-port", str(running.control_port)]
     argv += ["--ws-port", str(port), "--link-port", "0"]
-    argv += ["--tls-cert", str(certificates.certificate("endpoint"))]
-    argv += ["--tls-key", str(certificates.key("endpoint"))]
+    if certificates is not None:
+        argv += ["--tls-cert", str(certificates.certificate("endpoint"))]
+        argv += ["--tls-key", str(certificates.key("endpoint"))]
     env = os.environ | {"XDG_RUNTIME_DIR": str(running.folder)}
     child = await Child.start("rce-robot", argv, env=env)
     try:
@@ -54,8 +63,7 @@ async def tls_endpoint(
             if "ready:" in line:
                 break
         drain = asyncio.create_task(_drain(child))
-        trusting = ssl.create_default_context(cafile=certificates.authority)
-        yield f"wss://127.0.0.1:{port}/", trusting, psutil.Process(child.pid)
+        yield f"{'ws' if certificates is None else 'wss'}://127.0.0.1:{port}/", psutil.Process(child.pid)
         drain.cancel()
     finally:
         await child.stop()
@@ -70,10 +78,13 @@ async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
     """Measure both, trip by trip in turn, with new containers in each pass."""
     times: Figures = {}
     costs: Figures = {}
-    plain_url = await locate(running.url)  # while only one endpoint runs
-    (endpoint,) = running.named("rce_robot")
-    async with tls_endpoint(running) as (url, trusting, secured_endpoint):
-        endpoints = {"plain": endpoint, "tls": secured_endpoint}
+    certificates = make_certificates(running)
+    trusting = ssl.create_default_context(cafile=certificates.authority)
+    async with (
+        endpoint(running) as (plain_url, plain_endpoint),
+        endpoint(running, certificates) as (url, secured_endpoint),
+    ):
+        endpoints = {"plain": plain_endpoint, "tls": secured_endpoint}
         for number in range(passes):
             for form, make_trip in _TRIPS.items():
                 async with (
