@@ -80,20 +80,24 @@ def _round_trips(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def _targets(summary: dict[str, Any]) -> Iterator[str]:
-    yield "| | measured | target | |"
-    yield "|---|---:|---:|---|"
+    yield "| | measured | target | | date, commit, processor |"
+    yield "|---|---:|---:|---|---|"
     for target in TARGETS:
         entry = summary.get(target.suite)
         figure = None if entry is None else target.read(entry["rows"])
-        yield f"| {target.what} | {_judged(target, figure)} |"
+        of = "" if entry is None or figure is None else _measured_briefly(entry["machine"])
+        yield f"| {target.what} | {_judged(target, figure)} | {of} |"
 
 
 def _judged(target: Target, figure: float | None) -> str:
-    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.unit}"
     if figure is None:
-        return f"not measured | {wanted} | "
+        return f"not measured | {target.wanted} | "
     verdict = "met" if target.is_met(figure) else "**missed**"
-    return f"{figure:g} {target.unit} | {wanted} | {verdict}"
+    return f"{f'{figure:g} {target.unit}'.rstrip()} | {target.wanted} | {verdict}"
+
+
+def _measured_briefly(machine: dict[str, Any]) -> str:
+    return ", ".join(filter(None, (machine["date"][:10], machine.get("commit"), machine.get("processor"))))
 
 
 def _shown(value: object) -> str:

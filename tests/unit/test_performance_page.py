@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.page import block, made
 from benchmarks import exploration, figures, mapping, traffic
 from benchmarks.figures import Results
+from benchmarks.page import block, made
 from benchmarks.summary import merged
 from benchmarks.targets import TARGETS
 
@@ -46,7 +47,6 @@ def test_newest_result_of_each_suite_is_kept() -> None:
     assert set(merged({}, "ros", {"machine": machine("2026-01-01"), "echo": []})) == {"ros.echo"}
 
 
-@pytest.mark.parametrize(
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where results are saved."""
@@ -128,17 +128,26 @@ def test_traffic_of_another_planner_is_not_saved(
     assert (folder / "traffic.json").exists() == saved
 
 
+@pytest.mark.parametrize(
     ("figure", "line"),
     [
-        (249.5, "| 249.5 ms | ≤ 250 ms | met |"),
-        (250.5, "| 250.5 ms | ≤ 250 ms | **missed** |"),
+        (249.5, "| 249.5 ms | ≤ 250 ms | met | 2026-01-01, abc, A processor |"),
+        (250.5, "| 250.5 ms | ≤ 250 ms | **missed** | 2026-01-01, abc, A processor |"),
     ],
 )
 def test_missed_target_is_marked(figure: float, line: str) -> None:
     summary = {"start": {"machine": machine("2026-01-01"), "rows": [{"containers": 5, "p50_ms": figure}]}}
     table = block("targets", summary)
     assert f"| container start to first message, p50 {line}" in table
-    assert "| 100 containers at once | not measured | ≤ 20 s |" in table
+    assert "| 100 containers at once | not measured | ≤ 20 s |  |  |" in table
+
+
+@pytest.mark.parametrize(("figure", "verdict"), [(0.5, "**missed**"), (3.0, "met"), (6.5, "**missed**")])
+def test_target_with_two_limits(figure: float, verdict: str) -> None:
+    rows = [{"sensor": "lidar", "NEES": figure}]
+    summary = {"localization.lidar": {"machine": machine("2026-01-01"), "rows": rows}}
+    line = f"lidar: NEES, mean | {figure:g} | 1 to 6 | {verdict} |"
+    assert line in block("targets", summary)
 
 
 def test_targets_read_the_rows_of_the_suites() -> None:
