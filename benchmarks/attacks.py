@@ -1,4 +1,7 @@
-"""Ways to abuse the robot endpoint: ``python -m benchmarks.attacks KIND URL`` attacks until it is killed."""
+"""Ways to abuse the robot endpoint: ``python -m benchmarks.attacks KIND URL`` attacks until it is killed.
+
+It prints once a second how often it has done what it does, unless it can do nothing.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +14,39 @@ import os
 import struct
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
+from time import monotonic
 
 import uvloop
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import WebSocketException
 
 USER = PASSWORD = "abuser"
 BUSY = "busy processes"
+PROGRESS = "progress"
+"""First word of the lines with the count."""
 STRING, IMAGE = "std_msgs/String", "sensor_msgs/Image"
 _MASK = bytes(4)
 _ID = b"0" * 32
 
 Attack = Callable[[str], Awaitable[None]]
+
+
+class Progress:
+    """How often this process has done what it does."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._printed_at = 0.0
+
+    def add(self) -> None:
+        """Count, and print the count once a second."""
+        self._count += 1
+        if (now := monotonic()) - self._printed_at >= 1.0:
+            self._printed_at = now
+            print(PROGRESS, self._count, flush=True)
+
+
+_progress = Progress()
 
 
 @contextlib.asynccontextmanager
@@ -53,6 +77,12 @@ async def send(socket: ClientConnection, kind: str, data: object) -> None:
     await socket.send(json.dumps({"type": kind, "data": data}))
 
 
+async def push(socket: ClientConnection, frame: str | bytes) -> None:
+    """Send a frame of an attack."""
+    await socket.send(frame)
+    _progress.add()
+
+
 def data_message(msg: str, message_type: str = STRING) -> str:
     """The text of a data message of the looped interface."""
     return f'{{"type":"DM","data":{{"iTag":"out","type":"{message_type}","msgID":"nil","msg":{msg}}}}}'
@@ -73,7 +103,7 @@ def texts(*messages: str) -> Attack:
             reading = asyncio.create_task(drain(socket))
             while not reading.done():
                 for message in messages:
-                    await socket.send(message)
+                    await push(socket, message)
 
     return attack
 
@@ -85,7 +115,7 @@ async def frames(url: str) -> None:
         piece = (struct.pack("!BB", 0x81, 0x82) + _MASK + b"{}") * 8192
         while not reading.done():
             socket.transport.write(piece)
-            await socket.send("{}")  # waits for room in the buffer
+            await push(socket, "{}")  # waits for room in the buffer
 
 
 async def wrong_requests(url: str) -> None:
@@ -95,7 +125,7 @@ async def wrong_requests(url: str) -> None:
         item = {"endpointTag": "a0", "interfaceTag": "x", "interfaceType": "Nonsense", "className": "a/B"}
         text = json.dumps({"type": "CN", "data": {"addInterfaces": [item] * 500}})
         while not reading.done():
-            await socket.send(text)
+            await push(socket, text)
 
 
 async def changes(url: str) -> None:
@@ -107,8 +137,8 @@ async def changes(url: str) -> None:
         made = json.dumps({"type": "CN", "data": {"addInterfaces": [{**name, **kind} for name in names]}})
         gone = json.dumps({"type": "CN", "data": {"removeInterfaces": names}})
         while not reading.done():
-            await socket.send(made)
-            await socket.send(gone)
+            await push(socket, made)
+            await push(socket, gone)
 
 
 def images(picture: bytes) -> Attack:
@@ -121,7 +151,7 @@ def images(picture: bytes) -> Attack:
             text = {"iTag": "out", "type": IMAGE, "msgID": "nil", "msg*": _ID.decode()}
             while not reading.done():
                 await send(socket, "DM", text)
-                await socket.send(_ID + picture)
+                await push(socket, _ID + picture)
 
     return attack
 
@@ -152,7 +182,7 @@ async def slow(url: str) -> None:
         socket.transport.pause_reading()
         text = data_message(json.dumps({"data": "x" * 5_000_000}))
         while True:
-            await socket.send(text)
+            await push(socket, text)
 
 
 async def halves(url: str) -> None:
@@ -162,10 +192,14 @@ async def halves(url: str) -> None:
         size = 60_000_000
         header = struct.pack("!BBQ", 0x82, 0xFF, size) + _MASK
         while True:
-            with contextlib.suppress(ConnectionClosed, OSError):
+            with contextlib.suppress(WebSocketException, OSError):
                 async with robot(url, name) as socket:
                     socket.transport.write(header + bytes(size - 1))
-                    await asyncio.wait_for(socket.wait_closed(), 10)
+                    for _ in range(10):
+                        _progress.add()
+                        with contextlib.suppress(TimeoutError):
+                            await asyncio.wait_for(socket.wait_closed(), 1.0)
+                            break
 
     await asyncio.gather(*(one(f"a{number}") for number in range(10)))
 
@@ -178,7 +212,7 @@ async def binaries(url: str) -> None:
         for number in range(1_000_000):
             if reading.done():
                 return
-            await socket.send(b"%032x" % number + value)
+            await push(socket, b"%032x" % number + value)
 
 
 _MANY = 199_000
@@ -203,21 +237,21 @@ KINDS: dict[str, Callable[[], Attack]] = {
 
 
 async def attack(kind: str, url: str) -> None:
-    """Attack until killed; reconnect after a disconnection."""
+    """Attack until killed; connect again after a disconnection or a refusal."""
     chosen = KINDS[kind]()
-    print("ready", flush=True)
     while True:
-        with contextlib.suppress(ConnectionClosed, OSError):
+        try:
             await chosen(url)
+        except (WebSocketException, OSError) as error:
+            print(f"{type(error).__name__}: {error}", flush=True)
         await asyncio.sleep(0.1)
 
 
 def burn(nice: int) -> None:
     """Use a processor at a priority until killed, without anything to do with the engine."""
     os.nice(nice)
-    print("ready", flush=True)
     while True:
-        pass
+        _progress.add()
 
 
 if __name__ == "__main__":
