@@ -1,7 +1,7 @@
 """Measure planners on MovingAI maps: ``python -m benchmarks.planning [--quick] [--only NAME ...]``.
 
 The maps are in the folder ``maps`` of ``$RCE_DATA``, or of ``shared/data`` beside the checkout. Every plan is
-checked by the independent checker. Times of first plans are the minimum of several runs; figures with more
+checked by the independent checker. Times of first plans are the least of nine seeds; figures with more
 time take ten seconds each. ``large`` tiles the warehouse, and ``baseline`` is the planner ``dijkstra``.
 """
 

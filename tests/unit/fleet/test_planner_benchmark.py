@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from benchmarks.fleet import byte_rates, plan_cost, pose_cost
+import asyncio
+from typing import Any, cast
+
+import pytest
+
+from benchmarks import fleet
+from benchmarks.fleet import _warm_up, byte_rates, joined, plan_cost, pose_cost
+from rce_fleet.coordination.replanning import PlanRequest
 
 
 def test_robots_of_the_benchmark_drive() -> None:
@@ -13,6 +20,30 @@ def test_robots_of_the_benchmark_drive() -> None:
 async def test_a_plan_is_made_beside_the_event_loop() -> None:
     row = await plan_cost(4)
     assert row["longest step ms"] > 0
+
+
+class CompilingWorker:
+    """A plan worker whose compiled loops take a while.
+
+    Attributes:
+        asked: For each plan, whether the loops were there.
+    """
+
+    def __init__(self) -> None:
+        self.is_compiled = False
+        self.asked: list[bool] = []
+
+    async def compute(self, request: PlanRequest) -> object:
+        self.asked.append(self.is_compiled)
+        asyncio.get_running_loop().call_later(0.05, setattr, self, "is_compiled", True)
+        return request.number
+
+
+async def test_plans_are_timed_with_compiled_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet, "is_available", lambda: True)
+    worker = CompilingWorker()
+    await _warm_up(cast("Any", worker), joined(20).requests.pop())
+    assert worker.asked == [False, True]
 
 
 async def test_traffic_of_driving_robots_is_counted() -> None:
