@@ -48,10 +48,12 @@ class Client:
                 await self.make_zone(f"zone{len(self.zones)}")
             await asyncio.sleep(0.1)
 
-    async def post(self, number: int) -> None:
+    async def post(self, number: int) -> int:
+        """Post an order; return the status: 200 if it was accepted before."""
         said = await self.fleet.ask("POST", "/tasks", delivery(number), key=f"order-{number}")
         assert said.status in (200, 201), said
         self.accepted[f"order-{number}"] = said.body["id"]
+        return said.status
 
     async def make_zone(self, name: str) -> None:
         rule = {"kind": "slow", "cells": [len(self.zones)], "value": 0.5}
@@ -83,8 +85,11 @@ async def test_kills_lose_no_task_and_repeat_none(tmp_path: Path) -> None:
         posting.cancel()
         await asyncio.wait([posting])
         assert posting.cancelled(), posting.exception()
-        for number in range(len(client.accepted) + 1):  # what the last, cancelled, request left open too
-            await client.post(number)
+        before = dict(client.accepted)
+        for number in range(len(before) + 1):  # what the last, cancelled, request left open too
+            status = await client.post(number)
+            assert status == 200 or f"order-{number}" not in before, f"order {number} was lost"
+        assert before.items() <= client.accepted.items()
         assert len(set(client.accepted.values())) == len(client.accepted)
         for key, task in client.accepted.items():
             shown = await fleet.until_state(task, "done", "failed", "cancelled")
