@@ -25,6 +25,8 @@ from tools.leaks import Traces, footprint
 CONTAINERS = 3
 LONGEST_PAUSE_S = 0.4
 SETTLE_S = 60.0
+RETURN_S = 120.0
+"""More than the longest pause before a container that failed often is created again."""
 MASTER_AND_MANAGER = 0.25
 """How often the victim is one of the two programs, and not a process below them."""
 DESTROYED = 0.5
@@ -125,20 +127,33 @@ class Chaos:
                 os.kill(victim, signal.SIGKILL)
 
     async def kill_all(self) -> None:
-        """Kill the manager and all that it has made, at once."""
+        """Kill the master, and the manager with all that it has made, at once."""
         self.story.append("kill all")
         victims = [pid for pids in parts(self.traces).values() for pid in pids]
-        for pid in (self.engine.container.pid, *victims):
+        programs = (self.engine.master, self.engine.container)
+        for pid in (*(program.pid for program in programs), *victims):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        await self.engine.container.kill()
-        await self.engine.container.start()
+        for program in programs:
+            assert program.process is not None
+            await program.process.wait()
+        for program in programs:
+            await program.start()
 
     async def settle(self) -> None:
-        """Ask for what is wanted, as clients do, until it is there."""
+        """Ask for what is wanted, at least one container, as clients do, until it is there."""
+        if not any(one.wants for one in self.customers):
+            self.customers[0].wants = True
         for one in self.customers:
             if one.wants:
                 await until(partial(self._is_served, one), timeout=SETTLE_S, what=one.container)
+
+    async def check_that_all_returns(self) -> None:
+        """Kill all once more, and wait for what is wanted, which only the engine remembers."""
+        await self.kill_all()
+        for one in self.customers:
+            if one.wants:
+                await until(one.echoes, timeout=RETURN_S, what=f"{one.container} returns")
 
     async def _is_served(self, one: Customer) -> bool:
         await one.create()
@@ -218,6 +233,7 @@ async def run(runtime: str, seed: int, rounds: int, *, groups: bool) -> list[str
             await chaos.run(rounds)
             await chaos.kill_all()
             await chaos.settle()
+            await chaos.check_that_all_returns()
             for one in crowd:
                 await one.destroy()
             await until(lambda: not traces.left(allowed(engine)), timeout=SETTLE_S, what="nothing is left")
