@@ -240,20 +240,27 @@ class Dispatcher:
 
     def _grant(self) -> None:
         """Grant cells to robots whose turn it may be; to some of them, if there are many."""
-        ledger = self.state.ledger
-        ripe = ledger.take_ripe()
-        if not ripe and not self._ripe:
+        left = self.settings.robots_per_step
+        self._take_ripe()
+        while left and self._ripe:
+            robots = list(islice(self._ripe, left))
+            left -= len(robots)
+            for robot in robots:
+                del self._ripe[robot]
+                self._grant_one(robot)
+            self._take_ripe()  # A robot that was held gave cells back.
+
+    def _take_ripe(self) -> None:
+        self._ripe |= dict.fromkeys(sorted(self.state.ledger.take_ripe()))
+
+    def _grant_one(self, robot: str) -> None:
+        ledger, record = self.state.ledger, self.state.robots.get(robot)
+        if record is None or record.phase is not Phase.ACTIVE or record.leaving:
             return
-        self._ripe |= dict.fromkeys(sorted(ripe))
-        for robot in list(islice(self._ripe, self.settings.robots_per_step)):
-            del self._ripe[robot]
-            record = self.state.robots.get(robot)
-            if record is None or record.phase is not Phase.ACTIVE or record.leaving:
-                continue
-            if not self._way_is_clear(record) and ledger.may_grant(robot, self.settings.ahead):
-                self.hold(record, "another robot is in its way")
-            elif ledger.grant(robot, self.settings.ahead):
-                self.send(record, tuple(ledger.granted(robot)))
+        if not self._way_is_clear(record) and ledger.may_grant(robot, self.settings.ahead):
+            self.hold(record, "another robot is in its way")
+        elif ledger.grant(robot, self.settings.ahead):
+            self.send(record, tuple(ledger.granted(robot)))
 
     # One robot
 

@@ -178,6 +178,7 @@ def crowd(rng: Random, grid: GridMap, count: int) -> list[tuple[float, float]]:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(2, 8))
 @example(seed=100000, count=7)  # the pose of a robot jumps while it is stopping between two cells
+@example(seed=410003, count=8)  # a robot that is held gives a cell back that another one waits for
 def test_robots_that_say_they_are_elsewhere_meet_no_other(
     make_fleet: type[SimulatedClients], seed: int, count: int
 ) -> None:
