@@ -82,6 +82,7 @@ def test_no_import_leaves_the_table() -> None:
     assert wrong == []
 
 
+@pytest.mark.slow
 def test_no_row_allows_more_than_is_used() -> None:
     """Rows of the lower packages name what they need, and no more."""
     rows = {name: allowed for name, allowed in table().items() if name.startswith(("rce.", "rce_fleet."))}

@@ -31,6 +31,7 @@ def machine(date: str) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_page_is_current() -> None:
     argv = [sys.executable, "-m", "benchmarks.page", "--check"]
     done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=False)

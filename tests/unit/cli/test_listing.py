@@ -43,6 +43,7 @@ def test_line_is_that_of_the_reference(point: EntryPoint) -> None:
     assert " ".join(summary.partition("\n\n")[0].split()) == found[1]
 
 
+@pytest.mark.slow
 def test_no_command_is_imported() -> None:
     done = subprocess.run([sys.executable, "-c", LIST], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

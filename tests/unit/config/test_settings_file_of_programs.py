@@ -126,6 +126,7 @@ def test_shipped_file_says_every_default(name: str, tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_core_runs_with_the_file(file: str) -> None:
     process = subprocess.Popen(
         [str(Path(sys.executable).parent / "rce"), "core", "--config", file],

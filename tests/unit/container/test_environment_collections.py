@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 PROGRAM = """
 import gc, pathlib, socket, sys
 from rce_container.environment import messages, running
@@ -23,6 +25,7 @@ running.run_environment(boot, *socket.socketpair())
 """
 
 
+@pytest.mark.slow
 def test_growing_environment_is_seldom_collected_as_a_whole(tmp_path: Path) -> None:
     """Each time its ROS core is held: the more interfaces there are, the longer."""
     subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], check=True, timeout=120)

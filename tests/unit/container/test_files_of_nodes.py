@@ -30,6 +30,7 @@ def deep(tmp_path: Path) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_very_deep_trees_are_removed(deep: Path) -> None:
     assert size_of(deep) == 5
     remove(deep)
@@ -37,6 +38,7 @@ def test_very_deep_trees_are_removed(deep: Path) -> None:
     remove(deep)
 
 
+@pytest.mark.slow
 def test_a_containers_folder_goes_however_deep_it_is(deep: Path, tmp_path: Path) -> None:
     folder = ContainerFolder(tmp_path / "containers", tmp_path / "run", "0" * 12)
     folder.make()

@@ -38,6 +38,7 @@ def often_switched() -> Iterator[None]:
     sys.setswitchinterval(before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("often_switched")
 def test_volumes_come_and_go_while_they_are_measured(tmp_path: Path) -> None:
     """A thread measures; the event loop gives volumes to containers meanwhile.

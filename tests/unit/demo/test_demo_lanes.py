@@ -56,6 +56,7 @@ def test_robots_start_on_lanes_and_can_reach_their_goals(seed: int) -> None:
     assert all_arrive(scenario, lanes)
 
 
+@pytest.mark.slow
 def test_the_planner_gets_the_lanes_themselves() -> None:
     """It is in a container, which does not see the file."""
     lanes = found(EXAMPLE)

@@ -32,6 +32,7 @@ def build(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_a_site_without_broken_links_is_built(tmp_path: Path) -> None:
     done = build(tmp_path, GOOD)
     assert done.returncode == 0, done.stderr

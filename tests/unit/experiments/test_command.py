@@ -46,6 +46,7 @@ def invoke(*words: str | Path) -> tuple[int, str]:
     return shown.exit_code, " ".join(shown.output.split())
 
 
+@pytest.mark.slow
 def test_as_many_runs_are_made_as_were_begun(data: Path) -> None:
     """Two set-ups, a warm-up of each, and 20 runs."""
     assert "2 set-ups 42 runs" in invoke("--resume", data, "--plan")[1]
@@ -71,6 +72,7 @@ def test_rows_of_other_machines_and_versions_are_not_mixed(
     assert (code, text in told) == (1, True), told
 
 
+@pytest.mark.slow
 @pytest.mark.needs("netns")
 def test_a_folder_is_used_by_one_command_at_a_time(data: Path) -> None:
     """Both would make the same runs, which disturb each other."""
@@ -94,6 +96,7 @@ def test_a_second_experiment_is_told_that_it_is_not_alone(
         assert again
 
 
+@pytest.mark.slow
 @pytest.mark.needs("netns")
 def test_two_experiments_at_once_say_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each would spoil the figures of the other, for hours. The plan of this one is done already."""
@@ -130,6 +133,7 @@ def test_the_commit_is_not_that_of_a_repository_around_it(tmp_path: Path) -> Non
     assert environment.commit(package) == f"{head.strip()}+"
 
 
+@pytest.mark.slow
 @pytest.mark.needs("netns")
 @pytest.mark.parametrize(("runs", "noted"), [(30, 30), (5, 20)])
 def test_the_description_has_all_runs_that_were_asked_for(data: Path, runs: int, noted: int) -> None:

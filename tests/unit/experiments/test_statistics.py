@@ -22,6 +22,7 @@ def test_the_interval_is_that_of_scipy() -> None:
     assert found == estimate(list(values))
 
 
+@pytest.mark.slow
 def test_the_interval_covers_the_true_median() -> None:
     """In some 95 of 100 experiments; the percentile bootstrap of 10 runs is a little too narrow."""
     random = np.random.default_rng(7)
@@ -29,6 +30,7 @@ def test_the_interval_covers_the_true_median() -> None:
     assert covered >= 176
 
 
+@pytest.mark.slow
 def test_the_interval_of_three_runs_is_their_range() -> None:
     """By hand: all three are above the true median, or all below it, in 2 / 8 of the experiments."""
     random = np.random.default_rng(7)

@@ -55,6 +55,7 @@ def arrive(fleet: SimulatedClients) -> None:
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("up", [0.0, 0.4])
 def test_a_lost_robot_found_in_the_way_stops_others(
@@ -129,6 +130,7 @@ def test_a_robot_in_a_cell_of_another_can_be_removed(make_fleet: type[SimulatedC
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_paused_robot_pushed_twice_is_placed_anew(make_fleet: type[SimulatedClients], seed: int) -> None:
     """First to the corner of its cell, and then into the one that it overlapped there."""
@@ -163,6 +165,7 @@ def test_a_silent_robot_pushed_off_its_path_is_stopped(make_fleet: type[Simulate
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_silent_robot_is_stopped_before_a_robot_in_its_way(
     make_fleet: type[SimulatedClients], seed: int

@@ -96,6 +96,7 @@ def cache(tmp_path: Path) -> Cache:
     return made
 
 
+@pytest.mark.slow
 def test_every_module_with_loops_is_compiled() -> None:
     marks = re.compile(r"^(?:@|\w+ = )kernel\(", re.MULTILINE)
     found = {

@@ -87,6 +87,7 @@ def test_a_map_of_many_parts_has_a_scenario() -> None:
         assert 189 <= column <= 194
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32))
 def test_midway_cell_cuts_off_no_goal(seed: int) -> None:

@@ -72,6 +72,7 @@ def test_robots_never_drive_against_a_lane(
     assert driven <= ONE_WAY.moves.keys()
 
 
+@pytest.mark.slow
 def test_slow_lanes_are_avoided(make_fleet: type[SimulatedClients], settings: FleetSettings) -> None:
     fleet = make_fleet(on_lanes(PACES, settings), [1], 1, loss=0.0)
     fleet.send([7])

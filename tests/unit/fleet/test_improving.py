@@ -109,6 +109,7 @@ def test_better_paths_are_not_looked_for_again_in_vain() -> None:
     assert any(crowd.ask() for _ in range(5))
 
 
+@pytest.mark.slow
 def test_nothing_is_granted_while_better_paths_are_looked_for() -> None:
     crowd = Crowd()
     assert crowd.ask()

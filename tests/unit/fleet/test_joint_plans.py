@@ -29,6 +29,7 @@ def check(grid: GridMap, joint: JointPlan, starts: list[int]) -> None:
                 seen.add(ahead)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 20))
 def test_plans_reach_their_goals_and_can_be_carried_out(seed: int, count: int) -> None:

@@ -143,6 +143,7 @@ def test_a_route_ends_before_a_cell_that_was_blocked_meanwhile(pair: PlannerHarn
     assert 23 not in pair.sent["R2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zone", "sent"),
     [
@@ -282,6 +283,7 @@ def test_a_plan_is_taken_over_with_the_events_after_it(slow: PlannerHarness) -> 
     assert len(slow.sent["R1"]) == len(slow.sent["R2"]) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", range(5))
 def test_what_changes_between_two_parts_of_a_plan_counts(slow: PlannerHarness, parts: int) -> None:
     """A route ends where a cell was blocked, or where its robot was stopped, and the others go on."""

@@ -92,6 +92,7 @@ def test_a_bag_becomes_a_map(tmp_path: Path) -> None:
     assert np.hypot(*(poses - true)[:, :2].T).mean() < 0.12
 
 
+@pytest.mark.slow
 def test_a_bag_has_the_records_that_were_written(tmp_path: Path) -> None:
     _, records = drive(laser=FRONT)
     write_bag(tmp_path / "run.bag", records)
@@ -114,6 +115,7 @@ def test_a_laser_of_a_bag_may_be_upside_down(tmp_path: Path) -> None:
         assert np.allclose(mine.points(), other.points()[::-1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_wrong_topics_of_a_bag_are_named(tmp_path: Path) -> None:
     write_bag(tmp_path / "run.bag", drive()[1], scan="/laser", odometry="/wheels")
     with pytest.raises(
@@ -126,6 +128,7 @@ def test_wrong_topics_of_a_bag_are_named(tmp_path: Path) -> None:
         read_log(tmp_path / "run.bag", scan="/laser", odometry="/laser")
 
 
+@pytest.mark.slow
 def test_a_truncated_bag_is_refused(tmp_path: Path) -> None:
     write_bag(tmp_path / "run.bag", drive()[1])
     content = (tmp_path / "run.bag").read_bytes()

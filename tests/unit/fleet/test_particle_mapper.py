@@ -67,6 +67,7 @@ def test_the_same_seed_gives_the_same_map() -> None:
     assert (first.trajectory() != other.trajectory()).any()
 
 
+@pytest.mark.slow
 def test_the_parameters_of_the_paper_give_a_map_by_odometry() -> None:
     parameters = FilterParameters(
         particles=1, srr=0, srt=0, str_=0, stt=0, minimum_score=10000, linear_update=0.2
@@ -106,6 +107,7 @@ def test_scans_are_used_after_way_turn_or_time() -> None:
         assert mapper.trajectory().shape == (60, 3)
 
 
+@pytest.mark.slow
 def test_scans_without_returns_are_bridged_by_odometry() -> None:
     _, records = drive()
     blind = [

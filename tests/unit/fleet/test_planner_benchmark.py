@@ -17,6 +17,7 @@ def test_robots_of_the_benchmark_drive() -> None:
     assert row["driving, us per pose"] > 0
 
 
+@pytest.mark.slow
 async def test_a_plan_is_made_beside_the_event_loop() -> None:
     row = await plan_cost(4)
     assert row["longest step ms"] > 0

@@ -55,6 +55,7 @@ def test_a_robot_that_rests_on_a_path_is_reported(make_fleet: type[SimulatedClie
     fleet.run(lambda: fleet.planner.snapshot().robots[0].reason == text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("starts", "goals"), [([0, 5], [5, 0]), ([0, 3], [5])])
 def test_deadlocks_are_resolved_if_asked(
     make_fleet: type[SimulatedClients], starts: list[int], goals: list[int]

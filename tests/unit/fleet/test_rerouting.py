@@ -118,6 +118,7 @@ def find(seed: int) -> tuple[GridMap, list[int], list[int], list[Route], int, Re
     return grid, starts, goals, routes, blocked, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_robots_with_new_paths_wait_in_no_circle(seed: int) -> None:
     """Whatever the order in which robots drive, they arrive, or wait for one that is in its goal."""

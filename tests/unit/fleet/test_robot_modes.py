@@ -61,6 +61,7 @@ def test_a_paused_robot_stops_and_drives_on_when_resumed(make: Make) -> None:
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode", [RobotMode.PAUSED, RobotMode.OUT_OF_SERVICE, RobotMode.DEAD, RobotMode.MANUAL]
 )

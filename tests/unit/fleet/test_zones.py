@@ -63,6 +63,7 @@ def blocked(name: str, *cells: int, **more: object) -> Zone:
     return Zone(name, ZoneKind.BLOCKED, cells, **more)  # type: ignore[arg-type]  # the fields of a zone
 
 
+@pytest.mark.slow
 def test_a_replaced_zone_blocks_its_new_cells(make: Make) -> None:
     """Also for single robots; a cell of two zones stays blocked until both are gone."""
     fleet = make(GridMap(), [], [])
@@ -84,6 +85,7 @@ def test_a_replaced_zone_blocks_its_new_cells(make: Make) -> None:
     assert state.blocked == {1, 4}
 
 
+@pytest.mark.slow
 def test_a_blocked_zone_blocks_until_it_is_removed(make: Make) -> None:
     fleet = make(LOOP, [0], [8])
     put(fleet, blocked("spill", 6, reason="oil", by="anna"))
@@ -116,6 +118,7 @@ def test_a_cell_stays_blocked_for_its_other_reasons(make: Make) -> None:
     assert fleet.planner.state.blocked == set()
 
 
+@pytest.mark.slow
 def test_a_zone_for_one_robot_leaves_the_way_to_others(make: Make) -> None:
     fleet = make(LOOP, [0, 18], [8, 7])
     put(fleet, blocked("narrow", 6, robots=("Robot1",)))
@@ -127,6 +130,7 @@ def test_a_zone_for_one_robot_leaves_the_way_to_others(make: Make) -> None:
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 def test_robots_keep_to_the_direction_of_a_one_way_zone(make: Make) -> None:
     """Rows 0 and 2 are a roundabout: the short way back is closed."""
     fleet = make(LOOP, [0], [5])
@@ -158,6 +162,7 @@ def test_a_one_way_zone_may_reach_the_edge_of_the_map(make: Make) -> None:
     fleet.run(fleet.all_arrived)
 
 
+@pytest.mark.slow
 def test_a_blocked_move_is_blocked_in_one_direction(make: Make) -> None:
     fleet = make(LOOP, [4], [])
     put(fleet, Zone("step", ZoneKind.BLOCKED, edges=((4, 5),)))
@@ -179,6 +184,7 @@ def test_a_slow_zone_limits_the_speed_and_is_avoided(make: Make) -> None:
     assert fleet.planner.state.zones.speed_limit("Robot1", [7]) == 0.1
 
 
+@pytest.mark.slow
 def test_a_limited_zone_has_room_for_its_capacity(make: Make) -> None:
     """Two robots want into an area with room for one; the second waits until the first has left."""
     fleet = make(LOOP, [0, 18], [])
@@ -339,6 +345,7 @@ def test_moves_are_closed_for_one_robot_only(
     assert not closed.isdisjoint(driven["Robot2"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
 def test_closing_all_ways_of_a_robot_stops_it(
     make_fleet: type[SimulatedClients], settings: FleetSettings

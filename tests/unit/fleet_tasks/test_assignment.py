@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pytest
+
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, _Group
 from rce_fleet.tasks.energy import BatteryLevels
@@ -60,6 +62,7 @@ def test_hundreds_of_robots_get_tasks_in_one_call() -> None:
     assert len({choice.robot for choice in chosen}) == len({choice.task.number for choice in chosen}) == 600
 
 
+@pytest.mark.slow
 def test_robots_with_profiles_of_their_own_have_their_turns() -> None:
     """Each was compared with each task in one step: with 1000 robots that took half a minute."""
     travel, grid = TravelCosts(), GridMap(20, 60)

@@ -107,6 +107,7 @@ def test_a_batch_has_the_times_of_all_tasks_from_all_places() -> None:
     assert problem.deadlines == [inf, inf]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "order",
     [{"robot": "Robot2"}, {"capabilities": ("lift",)}, {"payload": 9.0}],

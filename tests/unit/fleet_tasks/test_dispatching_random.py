@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -75,6 +76,7 @@ _THINGS = st.tuples(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.lists(_THINGS, min_size=5, max_size=25))
 @example([("post", 0, 0, 5), ("hold", 0, 0, 5), ("restart", 0, 0, 5)])
@@ -105,6 +107,7 @@ _LOSSES = st.tuples(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.lists(_LOSSES, min_size=5, max_size=25))
 def test_people_can_end_each_task_whatever_happened(things: list[tuple[str, int, int, int]]) -> None:

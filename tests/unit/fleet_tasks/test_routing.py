@@ -84,6 +84,7 @@ def test_a_queue_that_is_too_long_may_stay() -> None:
     assert improve(replace(problem, length=1), 0.1) == [[0, 1, 2], []]
 
 
+@pytest.mark.slow
 def test_a_task_with_a_deadline_comes_first() -> None:
     """Both are as far away, so that the one that is late costs more."""
     problem = on_a_line([50.0], [0.0, 100.0], [[0, 1]])

@@ -239,6 +239,7 @@ def test_estimates_become_distances_in_later_steps(monkeypatch: pytest.MonkeyPat
     assert before[1] < after[1] == travel.metres(3, 16, {"z": inf})
 
 
+@pytest.mark.slow
 def test_many_zones_for_some_robots_take_bounded_steps(floor: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A hundred robots with a zone each have a hundred times as many distances; a step computed them all."""
     floor.grid = floor.facts.grid = floor.book.grid = GridMap(30, 30)

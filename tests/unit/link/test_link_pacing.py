@@ -88,6 +88,7 @@ def test_bucket_says_when_its_debt_is_paid() -> None:
     assert bucket.pause(12.01) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [10_000, 1_000_000, 200_000_000])
 @pytest.mark.parametrize("senders", [1, 7])
 def test_senders_share_the_rate_equally(rate: int, senders: int) -> None:

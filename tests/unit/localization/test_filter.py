@@ -132,6 +132,7 @@ def test_fewer_particles_once_the_pose_is_known() -> None:
     assert amcl.particles.shape == (len(amcl.weights), 3)
 
 
+@pytest.mark.slow
 def test_the_covariance_covers_the_error() -> None:
     errors = []
     for seed in range(6):
@@ -144,6 +145,7 @@ def test_the_covariance_covers_the_error() -> None:
     assert 0.05 < np.mean(errors) < 12
 
 
+@pytest.mark.slow
 def test_a_robot_without_a_known_pose_is_found() -> None:
     amcl = Amcl(GRID, replace(SMALL, max_particles=4000), np.random.default_rng(3))
     amcl.scatter()
@@ -165,6 +167,7 @@ def test_the_first_scan_draws_particles_where_it_fits() -> None:
     assert len(x) <= SMALL.max_particles
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_moved_by_hand_is_found() -> None:
     amcl = filtered(replace(SMALL, max_particles=4000, recovery_alpha_slow=0.001, recovery_alpha_fast=0.1))
     drive(amcl, way(6))

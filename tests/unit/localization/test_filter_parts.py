@@ -158,6 +158,7 @@ def test_near_beams_count_less(beams: int, share: float) -> None:
     assert seen.independence == pytest.approx(share, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_compiled_likelihoods_equal_those_of_numpy() -> None:
     pytest.importorskip("numba")
     draw = rng(3)
@@ -176,6 +177,7 @@ def test_compiled_motion_equals_that_of_numpy() -> None:
     assert motion.turn_drive_turn.compile()(*given) == pytest.approx(motion.turn_drive_turn.numpy(*given))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_compiled_resampling_equals_that_of_numpy(seed: int) -> None:
     pytest.importorskip("numba")

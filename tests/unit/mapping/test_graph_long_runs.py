@@ -60,6 +60,7 @@ def test_jump_without_a_match_joins_nothing() -> None:
     assert max(np.abs(edge.pose[0]) for edge in mapper.graph.edges) < 2
 
 
+@pytest.mark.slow
 def test_jump_keeps_the_place_in_a_saved_map(tmp_path: Path) -> None:
     truth = drive(WAY)
     mapper = GraphMapper()

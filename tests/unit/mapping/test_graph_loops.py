@@ -138,6 +138,7 @@ def test_drive_around_block_closes_loops(driven: tuple[GraphMapper, Poses]) -> N
     assert worst_error(mapper.trajectory(), truth) < 0.05
 
 
+@pytest.mark.slow
 def test_every_scan_has_a_pose(driven: tuple[GraphMapper, Poses]) -> None:
     mapper, truth = driven
     assert mapper.trajectory().shape == truth.shape

@@ -86,6 +86,7 @@ def test_saved_map_is_the_same(saved: tuple[KeyGraph, Path, Poses]) -> None:
         assert np.array_equal(one.ranges, two.ranges)
 
 
+@pytest.mark.slow
 def test_loaded_map_is_continued_from_known_start(saved: tuple[KeyGraph, Path, Poses]) -> None:
     _, path, origin = saved
     mapper = GraphMapper(graph=load_graph(path))

@@ -165,6 +165,7 @@ async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCapture
     await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
 
 
+@pytest.mark.slow
 async def test_commands_fail_once_a_listener_failed() -> None:
     """Its master ends; its callers get an error."""
     store = FragileStore()

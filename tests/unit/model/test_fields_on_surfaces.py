@@ -281,6 +281,7 @@ print(json.dumps({
 """A program in which a container has one field more, by one more line in ``rce/model/specs.py``."""
 
 
+@pytest.mark.slow
 def test_new_field_of_a_container_is_one_line() -> None:
     """It is read, checked, sent, stored in the command, described and shown; nothing else was changed."""
     done = subprocess.run([sys.executable, "-c", NEW_FIELD], capture_output=True, text=True, check=False)

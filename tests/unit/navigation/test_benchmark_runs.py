@@ -21,6 +21,7 @@ def test_a_robot_reaches_its_goal_among_walkers() -> None:
     assert result.error < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["lidar", "camera"])
 def test_a_driving_robot_stays_localized(sensor: str) -> None:
     found = drive(5002, CAMERA if sensor == "camera" else SHIPPED, sensor, seconds=15.0)
@@ -29,6 +30,7 @@ def test_a_driving_robot_stays_localized(sensor: str) -> None:
     assert 0.1 < mean(found.nees) < 10.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_floor() -> None:
     first, again = Floor(3, walkers=2), Floor(3, walkers=2)
     for floor in (first, again):

@@ -160,6 +160,7 @@ def test_guidance_keeps_graphs_without_aisles() -> None:
     assert not guided(PlanningGraph.from_grid(SHELVES)).is_unweighted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotations", [False, True])
 def test_lifelong_robots_visit_their_goals_in_order(rotations: bool) -> None:
     rng = np.random.default_rng(4)
@@ -198,6 +199,7 @@ def test_lifelong_robot_without_a_way_is_named() -> None:
         LifelongPlanner(PlanningGraph.from_grid(grid), np.array([0], np.int32), lambda *_: 4)
 
 
+@pytest.mark.slow
 def test_compiled_loops_equal_plain_ones() -> None:
     """The same problem with all loops compiled, and with all of them plain, gives the same plans."""
     pytest.importorskip("numba")

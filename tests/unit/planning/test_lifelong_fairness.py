@@ -38,6 +38,7 @@ def lifelong(robots: int, seed: int, graph: PlanningGraph | None = None, **more:
     )
 
 
+@pytest.mark.slow
 def test_the_robot_without_a_goal_for_longest_arrives() -> None:
     """Once it is the most urgent, it needs at most its distance and two windows, in a crowd.
 

@@ -94,6 +94,7 @@ def test_no_time_or_no_effort_changes_nothing() -> None:
     assert improved(graph, robots, seconds=inf, effort=0).paths == {}
 
 
+@pytest.mark.slow
 def test_compiled_and_plain_loops_find_the_same() -> None:
     if not is_available():
         pytest.skip("numba is not installed")

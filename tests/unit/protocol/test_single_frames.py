@@ -66,6 +66,7 @@ def test_any_bytes_are_a_message_or_one_fault(data: bytes) -> None:
     assert isinstance(event, Fault | DataMessage)
 
 
+@pytest.mark.slow
 @given(st.recursive(st.none() | st.integers() | st.text(), lambda inner: st.dictionaries(st.text(), inner)))
 def test_any_json_as_header_is_one_fault(header: object) -> None:
     assert isinstance(feed(frame_of(header)), Fault)

@@ -92,6 +92,7 @@ def test_there_are_seven_parts() -> None:
     assert set(parse_action("Count", COUNT)) == set(SUFFIXES)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("actionlib")
 def test_texts_and_checksums_are_those_of_installed_classes(tmp_path: Path) -> None:
     """The package's .action files alone give what ROS generated from them."""

@@ -178,6 +178,7 @@ def test_a_whole_disk_is_not_searched(
     assert "more than 10 folders" in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.needs("rospy")
 def test_the_same_packages_are_found_as_by_rospkg(tmp_path: Path) -> None:
     """Of random trees; rospkg knows neither links that loop nor the marks of ROS 2's tools."""

@@ -68,6 +68,7 @@ def test_every_field_type_survives_the_wire(message: Any) -> None:
     assert EVERYTHING.deserialize(memoryview(bytearray(data))) == message
 
 
+@pytest.mark.slow
 @given(message_values(EVERYTHING))
 def test_size_is_that_of_the_written_message(message: Any) -> None:
     written = EVERYTHING.serialize(message)
@@ -87,6 +88,7 @@ def test_size_of_other_sequences() -> None:
     assert EVERYTHING.size(everything) == EVERYTHING.min_size
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: st.DataObject) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)

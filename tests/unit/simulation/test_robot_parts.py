@@ -101,6 +101,7 @@ def moved(spec: OdometrySpec, way: float, turn: float, seed: int, steps: int = 2
     return odometry.pose
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [5, 40])
 def test_odometry_has_the_variances_of_the_alpha_model(steps: int) -> None:
     """One update of amcl: straight on, then on the spot; whatever the time step is."""

@@ -138,6 +138,7 @@ def test_the_same_run_twice_reaches_the_goal() -> None:
     assert not compare([], []).reaches_goal
 
 
+@pytest.mark.slow
 def test_constant_metrics_are_counted_apart() -> None:
     """Losses of 0 lie in an interval from 0 to 0, whatever the machines do."""
     first, second = (
