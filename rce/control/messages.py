@@ -321,7 +321,7 @@ class StatusWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """One endpoint is no longer desired here. Answered by :class:`Gone`.
+    """One endpoint is not desired here any more. Answered by :class:`Gone`.
 
     Ignored for a robot whose login is newer: :class:`LoginReply` may overtake it in the task set.
     """
@@ -414,8 +414,7 @@ class SaveVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
 class RestoreVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Make a volume's files of a snapshot, in place of all others.
 
-    Without effect if they were made already: it may be repeated. A volume that a container has is not
-    replaced.
+    It may be repeated, without effect then. A volume that a container has is not replaced.
     """
 
     volume: str

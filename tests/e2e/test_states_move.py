@@ -212,73 +212,68 @@ async def log_in(master: MasterProcess) -> str:
         return str((await client.call("POST", "/login", body))["token"])
 
 
-async def test_a_count_moves_with_its_container(folder: Path) -> None:
+@asynccontextmanager
+async def single(folder: Path) -> AsyncIterator[tuple[MasterProcess, Cloud]]:
+    """Run one master with its store in a file, and machines for nodes that count."""
     master = Single(folder)
     await master.start(ready="rce-master ready")
     try:
         hosts = f"127.0.0.1:{master.control_port}"
         async with counting(folder, master.url, await log_in(master), hosts) as cloud:
-            await cloud.begin()
-            await cloud.handed_over("second")
-            await cloud.drained("second", "first")
-            await cloud.call("DELETE", "/machines/second/drain")
-            count = await cloud.lost(cloud.machines[0], "second")
-            await master.kill()
-            await master.start(ready="rce-master ready")
-            await cloud.passes(count, "second")
-            await cloud.start(cloud.machines[0])
-            await cloud.handed_over("first")
-            await check_commands(folder, master, cloud)
-            await cloud.call("DELETE", "/containers/C")
-            assert await cloud.state() == {}
-            await until(lambda: not _contents(master), what="its contents are removed")
+            yield master, cloud
     finally:
         assert await master.stop() == 0
+
+
+async def test_a_count_moves_with_its_container(folder: Path) -> None:
+    async with single(folder) as (master, cloud):
+        await cloud.begin()
+        await cloud.handed_over("second")
+        await cloud.drained("second", "first")
+        await cloud.call("DELETE", "/machines/second/drain")
+        count = await cloud.lost(cloud.machines[0], "second")
+        await master.kill()
+        await master.start(ready="rce-master ready")
+        await cloud.passes(count, "second")
+        await cloud.start(cloud.machines[0])
+        await cloud.handed_over("first")
+        await check_commands(folder, master, cloud)
+        await cloud.call("DELETE", "/containers/C")
+        assert await cloud.state() == {}
+        await until(lambda: not _contents(master), what="its contents are removed")
 
 
 async def test_a_count_moves_with_a_volume(folder: Path) -> None:
     """A container with both is ended, moved with its files, and counts on from the snapshot."""
-    master = Single(folder)
-    await master.start(ready="rce-master ready")
-    try:
-        hosts = f"127.0.0.1:{master.control_port}"
-        async with counting(folder, master.url, await log_in(master), hosts) as cloud:
-            await cloud.begin({"name": "files", "path": "/data", "size": "16M"})
-            await cloud.handed_over("second")
-            await cloud.drained("second", "first")
-            (volume,) = (await cloud.call("GET", "/volumes"))["volumes"]
-            assert volume["machine"] == "first"
-            await cloud.call("DELETE", "/containers/C")
-    finally:
-        assert await master.stop() == 0
+    async with single(folder) as (_, cloud):
+        await cloud.begin({"name": "files", "path": "/data", "size": "16M"})
+        await cloud.handed_over("second")
+        await cloud.drained("second", "first")
+        (volume,) = (await cloud.call("GET", "/volumes"))["volumes"]
+        assert volume["machine"] == "first"
+        await cloud.call("DELETE", "/containers/C")
 
 
 async def test_a_state_that_was_removed_moves(folder: Path) -> None:
     """It has not changed since its snapshot, and the node that has it is saved for the move."""
-    master = Single(folder)
-    await master.start(ready="rce-master ready")
-    try:
-        hosts = f"127.0.0.1:{master.control_port}"
-        async with counting(folder, master.url, await log_in(master), hosts) as cloud:
-            await cloud.start(cloud.machines[0])
-            await cloud.call("POST", "/containers", {"tag": "C"})
-            await cloud.call("POST", "/containers/C/nodes", FIXED)
-            first = await until(cloud.state, timeout=WAIT_S, what="the state is saved")
-            await cloud.start(cloud.machines[1])
-            await cloud.call("DELETE", "/states/C/count")
-            assert await cloud.state() == {}
-            await cloud.call("PUT", "/containers/C/machine", {"machine": "second"})
-            await cloud.is_up_at("second")
+    async with single(folder) as (_, cloud):
+        await cloud.start(cloud.machines[0])
+        await cloud.call("POST", "/containers", {"tag": "C"})
+        await cloud.call("POST", "/containers/C/nodes", FIXED)
+        first = await until(cloud.state, timeout=WAIT_S, what="the state is saved")
+        await cloud.start(cloud.machines[1])
+        await cloud.call("DELETE", "/states/C/count")
+        assert await cloud.state() == {}
+        await cloud.call("PUT", "/containers/C/machine", {"machine": "second"})
+        await cloud.is_up_at("second")
 
-            async def saved_there() -> dict[str, Any]:
-                state = await cloud.state()
-                return state if state.get("machine") == "second" else {}
+        async def saved_there() -> dict[str, Any]:
+            state = await cloud.state()
+            return state if state.get("machine") == "second" else {}
 
-            state = await until(saved_there, timeout=WAIT_S, what="the state is saved there")
-            assert state["sha256"] == first["sha256"]
-            await cloud.call("DELETE", "/containers/C")
-    finally:
-        assert await master.stop() == 0
+        state = await until(saved_there, timeout=WAIT_S, what="the state is saved there")
+        assert state["sha256"] == first["sha256"]
+        await cloud.call("DELETE", "/containers/C")
 
 
 async def check_commands(folder: Path, master: MasterProcess, cloud: Cloud) -> None:

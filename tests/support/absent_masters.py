@@ -1,4 +1,4 @@
-"""Masters that answer nothing: one that hangs, and one whose machine is off."""
+"""Masters that answer nothing: one that hangs, one whose machine is off, and one that a task set misses."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
+
+    from rce.control.exceptions import ControlError
+    from rce.control.messages import ClientReply, LoginReply, ToMaster
+    from rce.model import Request
 
 _FILLED_AFTER = 8
 """Connections that surely fill the shortest queue of a listening socket."""
@@ -47,3 +51,28 @@ def unreachable_port() -> Iterator[int]:
             with contextlib.suppress(BlockingIOError):
                 waiting.connect(listener.getsockname())
         yield listener.getsockname()[1]
+
+
+class FailingChannel:
+    """A channel on which each request fails with an error."""
+
+    def __init__(self, error: ControlError) -> None:
+        self.error = error
+
+    def send(self, message: ToMaster) -> None:
+        raise AssertionError(message)
+
+    async def login(
+        self, user: str, robot: str, password: str, address: str = "", token: str = ""
+    ) -> LoginReply:
+        raise self.error
+
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: object = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
+        raise self.error

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from support.absent_masters import FailingChannel
 
-from rce.control.exceptions import ControlError, MasterUnavailableError, UnsendableError
-from rce.control.messages import ClientReply, LoginReply, RequestFault, ToMaster
-from rce.model import EndpointId, FaultCode, Request
+from rce.control.exceptions import MasterUnavailableError, UnsendableError
+from rce.control.messages import ClientReply, RequestFault
+from rce.model import EndpointId, FaultCode
 from rce.model.requests import DestroyContainer
 from rce.protocol.messages import ErrorReport
 from rce_robot.master_requests import ask_master, reports_of
@@ -30,31 +31,6 @@ def test_codes_and_keys_of_a_later_release_are_left_out() -> None:
     fault = RequestFault(code="melted", ids={"rack": "7", "a": "x/y"})
     (report,) = reports_of(ClientReply(request=1, errors=("CX: no",), faults=(fault,)))
     assert report == ErrorReport(problem="CX: no", ids={"tagA": "x/y"})
-
-
-class FailingChannel:
-    """A channel on which each request fails with an error."""
-
-    def __init__(self, error: ControlError) -> None:
-        self.error = error
-
-    def send(self, message: ToMaster) -> None:
-        raise AssertionError(message)
-
-    async def login(
-        self, user: str, robot: str, password: str, address: str = "", token: str = ""
-    ) -> LoginReply:
-        raise self.error
-
-    async def client_request(
-        self,
-        id: str,  # noqa: A002 - wire names
-        type: str,  # noqa: A002
-        data: object = None,
-        *,
-        content: Request | None = None,
-    ) -> ClientReply:
-        raise self.error
 
 
 @pytest.mark.parametrize("typed", [True, False])

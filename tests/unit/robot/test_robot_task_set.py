@@ -7,18 +7,10 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, cast
 
 import pytest
+from support.absent_masters import FailingChannel
 
-from rce.control.messages import (
-    ClientReply,
-    Drop,
-    Gone,
-    Left,
-    LoginReply,
-    MachineInfo,
-    Put,
-    Sync,
-    ToMaster,
-)
+from rce.control.exceptions import MasterUnavailableError
+from rce.control.messages import Drop, Gone, Left, MachineInfo, Put, Sync, ToMaster
 from rce.control.model import EndpointKind, EndpointSpec, LinkAddress
 from rce.guard import Lobby
 from rce.link import Endpoint, LinkHub
@@ -32,36 +24,21 @@ from rce_robot.taskset import RobotTaskSet
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rce.model import Request
     from rce_robot.conversion import ConversionPool
     from rce_robot.doors.base import DoorSession
 
 ID = EndpointId("anna", "rob")
 
 
-class Channel:
+class Channel(FailingChannel):
     """Keeps what the task set sends."""
 
     def __init__(self) -> None:
+        super().__init__(MasterUnavailableError(0.0))
         self.sent: list[ToMaster] = []
 
     def send(self, message: ToMaster) -> None:
         self.sent.append(message)
-
-    async def login(
-        self, user: str, robot: str, password: str, address: str = "", token: str = ""
-    ) -> LoginReply:
-        raise NotImplementedError
-
-    async def client_request(
-        self,
-        id: str,  # noqa: A002 - wire names
-        type: str,  # noqa: A002
-        data: object = None,
-        *,
-        content: Request | None = None,
-    ) -> ClientReply:
-        raise NotImplementedError
 
     def ends(self) -> list[Left | Gone]:
         """Return what was told of robots' ends."""
