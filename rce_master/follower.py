@@ -21,6 +21,7 @@ from rce_master.exceptions import StoreError
 from rce_master.state.core import State, without_collections
 from rce_master.state.migration import conversion
 from rce_master.store.copying import check_finished
+from rce_master.store.etcd.client import LOAD_S
 from rce_master.store.etcd.exceptions import EtcdAwayError
 from rce_master.store.etcd.layout import Keys
 from rce_master.store.etcd.store import load_rows
@@ -287,14 +288,16 @@ class StateFollower:
             _GapError: It is not.
             StoreError: etcd cannot be asked.
         """
-        page = await self._client.range(self._keys.tables, written_after=self._verified)
+        page = await self._client.range(self._keys.tables, written_after=self._verified, timeout=LOAD_S)
         self._read = len(page.records)
         for record in sorted(page.records, key=lambda one: one.modified):
             self._assign(state, record.key, record.value)
         self._verified = page.revision
         if state.rows + len(self._unknown) != page.count:
             # Removals whose events are on their way, or were lost.
-            keys = await self._client.range(self._keys.tables, revision=page.revision, keys_only=True)
+            keys = await self._client.range(
+                self._keys.tables, revision=page.revision, keys_only=True, timeout=LOAD_S
+            )
             there = {record.key for record in keys.records}
             for key in {*self._held(state), *self._unknown} - there:
                 self._assign(state, key, None)

@@ -32,7 +32,7 @@ ATTEMPT_S = 1.0
 WATCH_BUFFER = 1 << 20
 """Bytes of a watch that are read ahead."""
 LOAD_S = 20.0
-"""The same for a page of records."""
+"""The same for a page of a table."""
 BYTES_PER_S = 100_000
 """How fast a member takes a request at least. Its gateway reads JSON slowly, and a request that is given up
 before it was read is not done."""
@@ -209,8 +209,12 @@ class EtcdClient:
         revision: int = 0,
         keys_only: bool = False,
         written_after: int = 0,
+        timeout: float | None = None,
     ) -> wire.Page:
-        """Read keys with a prefix, in their order; the arguments are those of :func:`wire.range_request`.
+        """Read keys with a prefix, in their order.
+
+        ``timeout`` is the seconds that one member may take; None: as long as for any small request. The other
+        arguments are those of :func:`wire.range_request`.
 
         Raises:
             EtcdRefusedError: etcd refused; with the code ``OUT_OF_RANGE`` the revision was compacted away.
@@ -224,7 +228,7 @@ class EtcdClient:
             keys_only=keys_only,
             written_after=written_after,
         )
-        return await self._call("v3/kv/range", request, wire.read_page, LOAD_S)
+        return await self._call("v3/kv/range", request, wire.read_page, timeout)
 
     async def transact(
         self,
@@ -364,6 +368,7 @@ class EtcdClient:
                     "GET" if body is None else "POST",
                     f"{scheme}://{endpoint}/{path}",
                     data=None if body is None else io.BytesIO(body),  # aiohttp sends it in pieces
+                    timeout=aiohttp.ClientTimeout(total=None, sock_connect=self._attempt),
                     ssl=True if self._tls is None else self._tls(),
                     allow_redirects=False,
                 ) as response,
@@ -371,6 +376,8 @@ class EtcdClient:
                 status, answer = response.status, await response.read()
         except aiohttp.ClientConnectorError as error:
             raise _FailedError(_connect_text(error), maybe_done=False) from error
+        except aiohttp.ConnectionTimeoutError:
+            raise _FailedError(f"no connection within {self._attempt:.3g} s", maybe_done=False) from None
         except TimeoutError:
             raise _FailedError(f"no answer within {timeout:.3g} s", maybe_done=True) from None
         except (aiohttp.ClientError, OSError) as error:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError, StoreError
+from rce_master.store.etcd.client import LOAD_S
 from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError, with_remedy
 from rce_master.store.etcd.layout import (
     Keys,
@@ -301,7 +302,9 @@ async def _load_pages(client: EtcdClient, keys: Keys) -> tuple[Snapshot, int]:
     revision = 0
     while page is None or page.more:
         after = "" if page is None else page.records[-1].key
-        page = await client.range(keys.tables, after=after, limit=PAGE_ROWS, revision=revision)
+        page = await client.range(
+            keys.tables, after=after, limit=PAGE_ROWS, revision=revision, timeout=LOAD_S
+        )
         revision = revision or page.revision
         for record in page.records:
             table, key = keys.read_row(record.key)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from aiohttp import web
 from support.engine import until
-from support.etcd import cluster
+from support.etcd import Cluster, cluster
 from support.go_between import LOOPBACK
 from support.masters import MasterProcess
 from support.ports import free_port
@@ -23,6 +23,7 @@ from rce_master.exceptions import StoreError
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore
+from rce_master.store.etcd.client import LOAD_S
 from rce_master.store.etcd.exceptions import EtcdAwayError
 from rce_master.store.etcd.layout import Keys, prepare
 from rce_master.store.etcd.wire import Put
@@ -132,6 +133,24 @@ async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
         second.send(signal.SIGCONT)
         await store.save([Row("users", "b", b"2")])
         assert await store.load() == {"users": {"a": b"1", "b": b"2"}}
+
+
+@pytest.mark.needs("etcd")
+async def test_a_silent_member_holds_no_look_at_the_lead(etcd: Cluster) -> None:
+    """It was cut off with its machine: connections to it are there, and nothing comes back."""
+    read: list[bytes] = []
+
+    async def never_answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.closing(writer):
+            while piece := await reader.read(1 << 16):
+                read.append(piece)
+
+    async with await asyncio.start_server(never_answer, LOOPBACK, 0) as server:
+        host, port = server.sockets[0].getsockname()
+        endpoints = [f"{host}:{port}", *etcd.endpoints]
+        async with EtcdClient(endpoints, attempt=0.2) as client, asyncio.timeout(LOAD_S / 2):
+            assert (await EtcdStore(client, "/silent").leadership()).leader is None
+    assert read
 
 
 async def check_runtime_faults(client: EtcdClient) -> None:
