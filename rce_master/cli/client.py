@@ -102,6 +102,8 @@ class ApiClient:
     ) -> Any:
         """Make a request. A POST whose answer is lost is repeated, with the key by which it is done once.
 
+        Only a log-in takes no key: the token of its lost answer expires.
+
         While the lead changes, it is repeated as long as the masters say that nothing was done. A master that
         does not answer is passed over for the next one; what cannot be repeated is sent to one that answers.
 
@@ -291,9 +293,13 @@ class ApiClient:
         while True:
             url = self._masters.current
             try:
-                async for event in self._stream(last):
-                    reached, last = True, event.id
-                    yield event
+                async for found in self._stream(last):
+                    reached = True
+                    if isinstance(found, Event):
+                        last = found.id
+                        yield found
+                    else:
+                        last = found
                 reached = True
             except (aiohttp.ClientError, TimeoutError, ApiError) as error:
                 if isinstance(error, ApiError) and error.status not in NOT_NOW:
@@ -306,7 +312,8 @@ class ApiClient:
                 self._masters.failed(url)
             await asyncio.sleep(RETRY_S)
 
-    async def _stream(self, last: int | None) -> AsyncIterator[Event]:
+    async def _stream(self, last: int | None) -> AsyncIterator[Event | int]:
+        """Yield events, and the id after which they begin, where a stream without events is resumed."""
         headers = {} if last is None else {"Last-Event-ID": str(last)}
         connect, answer = (CONNECT_S, ANSWER_S) if self._masters.has_others else (REQUEST_S, REQUEST_S)
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=connect, sock_read=STREAM_S)
@@ -317,9 +324,16 @@ class ApiClient:
         async with reply:
             if reply.status >= _OK:
                 await _result(reply)
+            begin: int | None = None
             async for line in reply.content:
-                if line.startswith(b"data: "):
+                if line.startswith(b"id: ") and (number := line[4:].strip()).isdigit():
+                    begin = int(number)
+                elif line.startswith(b"data: "):
+                    begin = None
                     yield msgspec.json.decode(line[6:], type=Event)
+                elif not line.strip() and begin is not None:
+                    yield begin
+                    begin = None
 
 
 def _words(error: Exception) -> str:

@@ -159,7 +159,8 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
     gap = _gap(call, scope, last)
     clock = asyncio.get_running_loop().time
     try:
-        await call.write(response, b": hello\n\n" + (b"" if gap is None else _frame(gap)))
+        # A client that loses the stream before the first event resumes it here, too.
+        await call.write(response, b"id: %d\n: hello\n\n" % last + (b"" if gap is None else _frame(gap)))
         last = last if gap is None else gap.id
         written = clock()
         while True:

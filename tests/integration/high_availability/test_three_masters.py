@@ -109,9 +109,9 @@ async def test_a_stand_by_forwards_what_it_is_asked(shared_masters: Masters) -> 
             assert (reply.status, "is not registered" in await reply.text()) == (403, True)
         async with session.get(f"{api}/events", params={"since": 0}) as reply:
             assert reply.headers["Content-Type"] == "text/event-stream"
-            lines = [await reply.content.readline() for _ in range(4)]
-            assert lines[:2] == [b": hello\n", b"\n"]
-            assert lines[2].startswith(b"id: ")
+            lines = [await reply.content.readline() for _ in range(5)]
+            assert lines[:3] == [b"id: 0\n", b": hello\n", b"\n"]
+            assert lines[4].startswith(b"event: ")
     assert "through_another" in await shared_masters.stored()
 
 

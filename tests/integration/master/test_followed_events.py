@@ -28,6 +28,7 @@ class Masters:
         response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
         await response.prepare(request)
         first = int(self.since[-1] or 0) + 1
+        await response.write(b"id: %d\n: hello\n\n" % (first - 1))
         for number in range(first, first + given):
             event = Event(id=number, time=1.0, kind="node_started", user="u", subject="u/c")
             await response.write(b"data: " + msgspec.json.encode(event) + b"\n\n")
@@ -50,6 +51,12 @@ async def test_a_stream_outlives_a_time_without_a_leader() -> None:
     masters = Masters(2, 503, 502, 2)
     assert await follow(masters, 4) == [1, 2, 3, 4]
     assert masters.since == ["", "2", "2", "2"]
+
+
+async def test_a_stream_without_events_is_resumed_where_it_began() -> None:
+    masters = Masters(0, 503, 1)
+    assert await follow(masters, 1) == [1]
+    assert masters.since == ["", "0", "0"]
 
 
 @pytest.mark.parametrize("answers", [(503,), (2, 401)])
