@@ -39,13 +39,15 @@ from rce_client.socket import EngineSocket
 if TYPE_CHECKING:
     import ssl
     from collections.abc import Callable, Sequence
+    from socket import socket as Socket  # noqa: N812 - here, a socket is the WebSocket
 
 
 _log = logging.getLogger(__name__)
 
-
 IN_USE_DELAY = 3.0
 """Maximum seconds until the next attempt if another client has the robotID."""
+_MOST_DOUBLINGS = 8
+"""Of the time for a TCP connection, before ``open`` limits it anyway."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +105,9 @@ class Timing:
     locate_next: float = 5.0
     """The same if another master is named that has not failed yet."""
     connect: float = 3.0
-    """Seconds for the TCP connection to one of several masters: a machine that is off answers nothing."""
+    """Seconds for the TCP connection to one of several masters, or to the endpoint: a machine that is off
+    answers nothing, and the next attempt may be sent to another one. Towards the endpoint they are doubled
+    each second time, up to ``open``: a slow network needs more."""
     open: float = 25.0
     """Seconds for the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
     ping_interval: float | None = 2.0
@@ -182,6 +186,8 @@ class EngineTransport:
         self._idle.set()
         self.connected = False
         self._was_connected = False
+        self._unreached = 0
+        """Attempts one after the other in which the endpoint's machine did not answer."""
         self.features: frozenset[str] = frozenset()
         """Optional protocol features of this connection's endpoint."""
         self.dropped = self._queue.dropped
@@ -297,8 +303,7 @@ class EngineTransport:
         masters.worked()
         parts = urlsplit(found.url)
         query, headers = target.handshake(header=found.takes_header)
-        async with asyncio.timeout(timing.open):
-            sock = await open_url_socket(found.url)
+        sock = await self._reach(found.url)
         socket = await connect(
             urlunsplit(parts._replace(query=f"{query}&{FEATURES_KEY}={','.join(sorted(FEATURES))}")),
             sock=sock,
@@ -315,6 +320,17 @@ class EngineTransport:
         )
         assert isinstance(socket, EngineSocket)
         return socket
+
+    async def _reach(self, url: str) -> Socket:
+        limit = self._timing.connect * 2 ** min(self._unreached // 2, _MOST_DOUBLINGS)
+        try:
+            async with asyncio.timeout(min(limit, self._timing.open)):
+                sock = await open_url_socket(url)
+        except TimeoutError:
+            self._unreached += 1
+            raise
+        self._unreached = 0
+        return sock
 
     async def _use(self, socket: EngineSocket) -> LostError:
         """Send and receive until the connection ends; return why it did."""

@@ -242,7 +242,9 @@ class Master:
             await make_dev_user(services)
         for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
         names = ServerNames(settings.bind, settings.names)
-        entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
+        entry = Entry(
+            services.state_service.tables, asyncio.get_running_loop().time, services.reconciler.silence
+        )
 
         def load() -> Callable[[], web.Application]:
             from rce_master.http.server import make_app  # takes 12 MB, which robots do not need

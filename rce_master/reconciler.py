@@ -66,6 +66,10 @@ class Peer(LogReader, Protocol):
     def features(self) -> frozenset[str]:
         """Its features that earlier releases do not have."""
 
+    @property
+    def silence(self) -> float:
+        """For how many seconds it gave no sign of life."""
+
     def send(self, message: ToTaskSet) -> None:
         """Send a message; the next ``Sync`` makes up for a lost one."""
 
@@ -99,6 +103,11 @@ class Reconciler:
     async def run(self) -> None:
         """Repeat reports that the store did not take, until cancelled."""
         await self._reports.run()
+
+    def silence(self, process: str) -> float:
+        """Return for how many seconds a task set gave no sign of life; 0 if it is not connected."""
+        peer = self._peers.get(process)
+        return 0.0 if peer is None else peer.silence
 
     # From the task sets
 

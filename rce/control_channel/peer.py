@@ -22,6 +22,7 @@ from rce.control import (
     encode,
 )
 from rce.control_channel.timeouts import MAX_QUEUED, MAX_TEXT, ControlTimeouts
+from rce.liveness.websocket import WatchedConnection
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,6 +72,11 @@ class Peer:
     def kind(self) -> TaskSetKind:
         """Which kind of task set it is."""
         return self.hello.kind
+
+    @property
+    def silence(self) -> float:
+        """For how many seconds it gave no sign of life."""
+        return self._socket.silence if isinstance(self._socket, WatchedConnection) else 0.0
 
     @property
     def features(self) -> frozenset[str]:

@@ -51,6 +51,11 @@ class Watch:
         self._looked = self._pinged = self._loop.time()
         self._timer = self._loop.call_later(self._liveness.period, self._look)
 
+    @property
+    def silence(self) -> float:
+        """For how many seconds there was no sign of life, as of the last look."""
+        return self._liveness.silent
+
     def stop(self) -> None:
         """Stop watching."""
         self._timer.cancel()

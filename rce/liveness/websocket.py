@@ -40,6 +40,11 @@ class WatchedConnection(Connection):
         """Whether the connection is open and its write buffer below the limit."""
         return not self.paused and self.protocol.state is State.OPEN
 
+    @property
+    def silence(self) -> float:
+        """For how many seconds the other side gave no sign of life; 0: it is not watched."""
+        return 0.0 if self._watch is None else self._watch.silence
+
     def watch(self, ping_interval: float, ping_timeout: float | None) -> None:
         """Ping the other side from now on, and end the connection if it gives no sign of life.
 

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from rce_master.state.records import TaskSet
     from rce_master.state.tables import Tables
 
+SILENT_S = 3.5
+"""A task set that gave no sign of life for so long gets no robots, if there is another one. Each gives one
+every 2 s (:class:`rce.control_channel.timeouts.ControlTimeouts`), and counts as gone after 10 s."""
 EXPECTED_S = 5.0
 """How long a redirected robot counts at its task set before it has logged in."""
 
@@ -32,11 +35,15 @@ class Entry:
     Args:
         tables: The state's tables.
         clock: Seconds that never go back.
+        silence: Tells for how many seconds a task set, by its name, gave no sign of life.
     """
 
-    def __init__(self, tables: Tables, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, tables: Tables, clock: Callable[[], float], silence: Callable[[str], float] = lambda _: 0.0
+    ) -> None:
         self._tables = tables
         self._clock = clock
+        self._silence = silence
         self._sent: deque[tuple[float, str]] = deque()
         self._expected: Counter[str] = Counter()
 
@@ -62,8 +69,9 @@ class Entry:
         while self._sent and (self._sent[0][0] <= now - EXPECTED_S or len(self._sent) >= MAX_EXPECTED):
             self._expected[self._sent.popleft()[1]] -= 1
         there = [one for one in robots.open_task_sets(self._tables) if one.url]
+        heard = [one for one in there if self._silence(one.process) < SILENT_S]
         chosen = min(
-            there, key=lambda s: (self._load(s) + self._expected[s.process], s.process), default=None
+            heard or there, key=lambda s: (self._load(s) + self._expected[s.process], s.process), default=None
         )
         if chosen is not None:
             self._sent.append((now, chosen.process))

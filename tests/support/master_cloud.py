@@ -79,6 +79,7 @@ class FakePeer:
         self.log = LogChunk(request=0, offset=5, text="hello")
         self.requests = 0
         self.features: frozenset[str] = frozenset()
+        self.silence = 0.0
 
     def send(self, message: ToTaskSet) -> None:
         self.inbox.put_nowait(message)

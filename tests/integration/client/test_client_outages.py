@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -466,6 +467,23 @@ async def test_a_master_that_answers_nothing_is_passed_over_soon(engine: Engine,
             Connection(masters, "testUser", PASSWORD, "testRobot", timing=timing) as conn,
         ):
             assert conn.connected
+
+
+async def test_an_endpoint_whose_machine_is_off_is_passed_over(engine: Engine) -> None:
+    """The master names it until it misses it, and another one then."""
+    there = engine.door.body
+    with unreachable_port() as port:
+        engine.door.body = json.dumps({"url": f"ws://127.0.0.1:{port}/"})
+        timing = replace(TIMING, connect=0.2, open=600.0)
+        async with asyncio.timeout(60), asyncio.TaskGroup() as tasks:
+            connection = Connection(engine.door.url, "testUser", PASSWORD, "testRobot", timing=timing)
+            opening = tasks.create_task(connection.__aenter__())
+            while len(engine.door.targets) < 5:
+                await asyncio.sleep(0.01)
+            engine.door.body = there
+            await opening
+            assert connection.connected
+            await connection.__aexit__(None, None, None)
 
 
 async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine) -> None:

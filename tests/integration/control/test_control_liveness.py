@@ -19,7 +19,7 @@ from rce.control_channel.dialing import Dialer
 from rce.masters import Masters
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from websockets.asyncio.client import ClientConnection
     from websockets.asyncio.server import ServerConnection
@@ -78,6 +78,29 @@ async def test_a_task_set_that_vanishes_amid_data_is_given_up() -> None:
             peer.send(Notify(id="u/r", text=LONG))
         async with asyncio.timeout(60):
             assert await master.gone.get() is peer
+
+
+async def test_the_silence_of_a_task_set_is_known() -> None:
+    """So the master sends no robots to one that hangs, before it gives it up."""
+    master = Master(timeouts=replace(PATIENT, ping_interval=1.0))
+    async with (
+        master.server,
+        SlowLink(f"ws://127.0.0.1:{master.server.port}").running() as link,
+        TaskSet(port_of(link.url), timeouts=replace(PATIENT, master_ping_interval=0.1)).running() as robots,
+    ):
+        peer, _ = await master.hellos.get()
+        await robots.channel.wait_connected()
+        link.hangs = True
+        await until(lambda: peer.silence > 2.0)
+        assert robots.channel.connected
+        link.hangs = False
+        await until(lambda: peer.silence == 0.0)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not condition():
+            await asyncio.sleep(0.02)
 
 
 async def test_a_master_that_vanishes_is_given_up(caplog: pytest.LogCaptureFixture) -> None:

@@ -27,6 +27,15 @@ def chosen(world: World) -> str:
     return "" if found is None else found.process
 
 
+def test_a_silent_task_set_gets_robots_only_if_no_other_is_there(two: World) -> None:
+    silent = {"r2"}
+    entry = Entry(two.state.tables, lambda: 0.0, lambda process: 4.0 * (process in silent))
+    found = [entry.choose() for _ in range(2)]
+    assert [one.process for one in found if one is not None] == ["r1", "r1"]
+    silent.add("r1")
+    assert entry.choose() is not None
+
+
 @pytest.fixture
 def two() -> World:
     """A robot with an interface at r1, and an empty task set r2."""
