@@ -164,13 +164,17 @@ class FleetManager:
         await self.tell_planner()
         await self._note_confirmed()
         if self.facts.is_live:
-            wanted = self.hand_goals.wanted(self.dispatcher.goals())
-            for robot, cell in self.goals.to_send(self.facts, wanted, now):
-                if not self.goals.is_newest(robot, cell):
-                    continue
-                refusal = await self._planner.set_goal(robot, cell)
-                if refusal:
-                    self.goals.refused(robot)
+            await self._send_goals(now)
+
+    async def _send_goals(self, now: float) -> None:
+        """Send the planner the goals that it shall have; one that falls silent gets the rest later."""
+        wanted = self.hand_goals.wanted(self.dispatcher.goals())
+        for robot, cell in self.goals.to_send(self.facts, wanted, now):
+            if not self.goals.is_newest(robot, cell):
+                continue
+            refusal = await self._planner.set_goal(robot, cell) if self.facts.is_live else NO_ANSWER
+            if refusal:
+                self.goals.refused(robot)
 
     async def _prepare_step(self) -> None:
         """Load and measure what the step needs; requests are answered meanwhile."""

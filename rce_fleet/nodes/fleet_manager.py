@@ -15,9 +15,10 @@ import time
 from collections import deque
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rce.aio.tasks import run_in_groups
+from rce.ros.errors import ServiceTimeoutError
 from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
 from rce.ros.types import TypesError
@@ -41,6 +42,9 @@ from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.tasks.records import Places, Zone
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 SERVICE = "/fleet/request"
 """Every fleet manager provides this service."""
@@ -67,9 +71,11 @@ class PlannerServices:
 
     Args:
         node: A running node.
+        on_silence: Called when the planner did not answer in time.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, on_silence: Callable[[], None] = lambda: None) -> None:
+        self._on_silence = on_silence
         self._set_goal = node.service_client("/fleet/set_goal", "fleet/SetGoal")
         self._block_cell = node.service_client("/fleet/block_cell", "fleet/BlockCell")
         self._set_mode = node.service_client("/fleet/set_mode", "fleet/SetMode")
@@ -102,6 +108,8 @@ class PlannerServices:
         try:
             answer = await client.call(request, timeout=CALL_TIMEOUT_S)
         except (RosError, TypesError) as error:  # a request that has no message form gets no answer either
+            if isinstance(error, ServiceTimeoutError):
+                self._on_silence()
             return f"{NO_ANSWER}: {error}"
         return "" if answer.ok else str(answer.message)
 
@@ -137,7 +145,7 @@ class ManagerNode:
         self._events = await node.advertise("/fleet/events", "std_msgs/String")
         self._manager = FleetManager(
             self._journal,
-            PlannerServices(node),
+            PlannerServices(node, self._miss_planner),
             rules_of(self._parameters),
             node.log,
             publish=self._publish,
@@ -181,10 +189,14 @@ class ManagerNode:
             for other in others:
                 other.cancel()
 
+    def _miss_planner(self) -> None:
+        """Send the planner nothing until its whole state has come: each call would wait for an answer."""
+        self._manager.facts.is_live = False
+        self._state_needed.set()
+
     async def _step(self) -> None:
         if time.monotonic() - self._heard_at > SILENT_S:
-            self._manager.facts.is_live = False
-            self._state_needed.set()
+            self._miss_planner()
         while self._requested and self._heard_at - self._requested[0][0] > SAME_PLANNER_S:
             self._manager.facts.requested = self._requested.popleft()[1]
         await self._manager.step()

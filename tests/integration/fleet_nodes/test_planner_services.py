@@ -42,8 +42,10 @@ async def manager(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Node]:
 
 
 async def test_a_planner_that_never_answers_ends_no_step(manager: Node) -> None:
-    refusal = await PlannerServices(manager).set_goal("Robot1", 5)
+    missed: list[bool] = []
+    refusal = await PlannerServices(manager, lambda: missed.append(True)).set_goal("Robot1", 5)
     assert refusal.startswith(NO_ANSWER)
+    assert missed == [True]
 
 
 async def test_a_station_does_not_wait_for_a_silent_planner(manager: Node) -> None:

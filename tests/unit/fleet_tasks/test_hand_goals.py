@@ -214,6 +214,32 @@ async def test_a_stop_counts_while_other_goals_are_sent(
     assert [cell for robot, cell in fleet.planner.sent if robot == stopped] == [None]
 
 
+async def test_a_planner_that_falls_silent_gets_the_other_goals_later(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each further call would wait for an answer, too."""
+    for robot, cell in (("Robot1", 5), ("Robot2", 60)):
+        fleet.manager.book.create(Order((Stop(Action.GO, (cell,)),), robot=robot), fleet.now)
+    send = fleet.planner.set_goal
+    asked: list[str] = []
+
+    async def fall_silent(robot: str, cell: int | None) -> str:
+        del cell
+        asked.append(robot)
+        fleet.manager.facts.is_live = False
+        return NO_ANSWER
+
+    monkeypatch.setattr(fleet.planner, "set_goal", fall_silent)
+    for _ in range(3):
+        await fleet.step()
+    assert len(asked) == 1
+    monkeypatch.setattr(fleet.planner, "set_goal", send)
+    fleet.manager.facts.is_live = True
+    for _ in range(10):
+        await fleet.step()
+    assert sorted(fleet.planner.sent) == [("Robot1", 5), ("Robot2", 60)]
+
+
 async def test_a_parking_robot_is_not_sent_by_another_program(fleet: Fleet) -> None:
     """The manager that sent it there was killed."""
     fleet.manager.book.emit(Places(parking=(20,)), "places", fleet.now)
