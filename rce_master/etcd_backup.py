@@ -13,13 +13,11 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msgspec.structs import replace
-
 from rce.tls import CertificateError
 from rce_master.backup import MASTER, BackupError, check_store, extract, locked, packages_in
 from rce_master.exceptions import StoreError
 from rce_master.packages.carrying import carry
-from rce_master.state.tables import Tables
+from rce_master.snapshots.carrying import without_snapshots
 from rce_master.state_service import load_converted
 from rce_master.store.base import Row
 from rce_master.store.copying import batches, check_finished, copy_rows
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
     from rce.config import EtcdAddress
     from rce.tls.choice import TlsChoice
     from rce_master.backup import Copy
-    from rce_master.store import Snapshot
 
 ATTEMPT_S = 5.0
 """How long one member of etcd may take for an answer."""
@@ -107,24 +104,13 @@ async def _import(folder: Path, address: EtcdAddress, tls: TlsChoice) -> None:
     copy = await SqliteStore.open(folder)
     try:
         term = await copy.begin_term()
-        snapshot = _without_snapshots(await load_converted(copy, term))
+        # A copy holds none of the snapshots' contents.
+        snapshot = without_snapshots(await load_converted(copy, term))
     finally:
         await copy.close()
     async with _connected(address, tls) as client:
         await prepare(client, address.prefix)
         await copy_rows(snapshot, EtcdStore(client, address.prefix), above=term + MORE_TERMS)
-
-
-def _without_snapshots(snapshot: Snapshot) -> Snapshot:
-    """Return a state whose volumes have no snapshots: a copy holds none of their contents."""
-    table = Tables().volumes
-    volumes: dict[str, bytes] = {}
-    for key, body in snapshot.get(table.name, {}).items():
-        table.write(key, body)
-        known = table[key]
-        forgotten = replace(known, snapshot="", kept=0, taken=0.0)
-        volumes[key] = table.encode(forgotten) if known.snapshot else body
-    return {**snapshot, table.name: volumes}
 
 
 @asynccontextmanager

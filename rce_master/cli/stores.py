@@ -22,7 +22,8 @@ from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import find_folder, find_state, give_to_owner, open_store
 from rce_master.exceptions import StoreBusyError
 from rce_master.packages.carrying import carry, packages_of, states_of
-from rce_master.packages.contents import ARCHIVES
+from rce_master.snapshots.carrying import carry_snapshots
+from rce_master.snapshots.service import SNAPSHOTS
 from rce_master.state_service import load_converted
 from rce_master.store.copying import copy_rows
 
@@ -43,7 +44,8 @@ def copy(
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            metavar="PATH", help="State folder of this machine's master on etcd: holds archives of packages."
+            metavar="PATH",
+            help="State folder of this machine's master on etcd: holds packages and snapshots.",
         ),
     ] = None,
 ) -> None:
@@ -72,14 +74,21 @@ async def _copy(source: str, target: str, state_dir: Path | None) -> None:
             new = await stack.enter_async_context(open_store(there, tls))
             snapshot = await load_converted(old, term)
             archives = carry([*packages_of(snapshot), *states_of(snapshot)], folder, new_folder)
+            snapshot, lost = carry_snapshots(snapshot, folder, new_folder)
             count = await copy_rows(snapshot, new, above=term)
         except StoreBusyError as error:
             raise CliError(f"{error}; the state is copied while no master runs") from error
     typer.echo(f"copied {count} records to {there}; start no master on {here} any more")
-    if archives and isinstance(there, EtcdAddress):
+    for volume in lost:
         typer.echo(
-            f"{archives} packages and states of nodes are in {new_folder / ARCHIVES}: start a master of this"
-            f" machine on that folder (--state-dir {new_folder}); the others get them from it"
+            f"volume {volume} is copied without its snapshot: parts of it in {folder / SNAPSHOTS} are missing"
+            " or damaged; if another master has it, empty the target, and copy with its state folder",
+            err=True,
+        )
+    if isinstance(there, EtcdAddress) and (archives or (new_folder / SNAPSHOTS).exists()):
+        typer.echo(
+            f"{archives} packages and states of nodes, and snapshots of volumes, are in {new_folder}: start a"
+            f" master of this machine on that folder (--state-dir {new_folder}); the others get them from it"
         )
 
 

@@ -54,7 +54,7 @@ def carry(contents: Iterable[UserPackage | SavedState], source: Path, target: Pa
     """
     names = {one.sha256: one.id for one in contents}
     try:
-        missing = [name for sha256, name in names.items() if _hash(source / ARCHIVES / sha256) != sha256]
+        missing = [name for sha256, name in names.items() if hash_of(source / ARCHIVES / sha256) != sha256]
         if missing:
             shown = ", ".join([*missing[:_SHOWN], *(["..."] if len(missing) > _SHOWN else [])])
             raise StoreError(
@@ -64,14 +64,14 @@ def carry(contents: Iterable[UserPackage | SavedState], source: Path, target: Pa
             )
         for sha256 in names:
             if not (target / ARCHIVES / sha256).exists():
-                _copy(source / ARCHIVES / sha256, target / ARCHIVES)
+                copy_file(source / ARCHIVES / sha256, target / ARCHIVES)
     except OSError as error:
         raise StoreError(f"cannot copy packages from {source} to {target}: {error}") from error
     return len(names)
 
 
-def _hash(path: Path) -> str:
-    """Return the hash of a file; empty if it does not exist."""
+def hash_of(path: Path) -> str:
+    """Return the SHA-256 of a file in hex; empty if it does not exist."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -79,7 +79,7 @@ def _hash(path: Path) -> str:
         return ""
 
 
-def _copy(path: Path, folder: Path) -> None:
+def copy_file(path: Path, folder: Path) -> None:
     """Copy a file into a folder, where it appears whole or not at all."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     descriptor, name = tempfile.mkstemp(dir=folder, prefix=".")

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
+from msgspec import structs
 from support.etcd import cluster
 from support.master_program import rce
 
 from rce.config import STORE_FILE, EngineSettings, MasterSettings
+from rce.control.snapshots import FileEntry, Manifest
 from rce_master.state.tables import Tables
 from rce_master.state.user_records import UserPackage
+from rce_master.state.volume_records import UserVolume
 from rce_master.store import Row, SqliteStore
 from rce_master.store.copying import UNFINISHED
 from rce_master.store.etcd import EtcdClient, EtcdStore
@@ -111,10 +114,53 @@ async def test_archives_of_packages_move_too(tmp_path: Path) -> None:
         archive.write_bytes(b"an archive")
         told = await rce(tmp_path, "master", *copy)
         beside = tmp_path / "beside" / "master" / "bundles" / archive.name
-        assert f"1 packages and states of nodes are in {beside.parent}" in told
+        assert (
+            f"1 packages and states of nodes, and snapshots of volumes, are in {beside.parent.parent}" in told
+        )
         assert beside.read_bytes() == b"an archive"
         await rce(tmp_path, "master", "copy", "--from", etcd.store, "--to", "sqlite:back", *own)
     assert (tmp_path / "back" / "master" / "bundles" / archive.name).read_bytes() == b"an archive"
+
+
+async def add_volumes(folder: Path, *volumes: UserVolume) -> None:
+    store = await SqliteStore.open(folder / "state" / "master")
+    rows = [Row(Tables().volumes.name, volume.id, msgspec.json.encode(volume)) for volume in volumes]
+    await store.save(rows, await store.begin_term())
+    await store.close()
+
+
+async def test_snapshots_of_volumes_move_too(tmp_path: Path) -> None:
+    """A volume whose snapshot lacks a part has none at the target, where masters would look without end."""
+    await make_state(tmp_path)
+    piece, missing = (bytes([number]) * 1000 for number in range(2))
+    file = FileEntry(
+        path=b"f", mode=0o644, modified_ns=1, size=1000, pieces=(hashlib.sha256(piece).digest(),)
+    )
+    manifest = Manifest(entries=(file,)).encode()
+    other = structs.replace(file, pieces=(hashlib.sha256(missing).digest(),))
+    damaged = Manifest(entries=(file, structs.replace(other, path=b"g"))).encode()
+    contents = {hashlib.sha256(each).hexdigest(): each for each in (piece, manifest, damaged)}
+    names = list(contents)
+    whole = UserVolume(user="anna", name="a", size=1, snapshot=names[1], kept=1000, taken=7.0)
+    lost = UserVolume(user="anna", name="b", size=1, snapshot=names[2], kept=2000, taken=7.0)
+    await add_volumes(tmp_path, whole, lost)
+    (tmp_path / "state" / "master" / "snapshots").mkdir()
+    for name, content in contents.items():
+        (tmp_path / "state" / "master" / "snapshots" / name).write_bytes(content)
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=20.0) as client:
+        told = await rce(
+            *(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", f"{etcd.store}/one"),
+            *("--state-dir", "beside/master"),
+        )
+        rows = (await EtcdStore(client, "/one").load())["volumes"]
+    assert "volume anna/b is copied without its snapshot" in told
+    assert "volume anna/a" not in told
+    found = {key: msgspec.json.decode(body, type=UserVolume) for key, body in rows.items()}
+    assert found == {whole.id: whole, lost.id: structs.replace(lost, snapshot="", kept=0, taken=0.0)}
+    beside = tmp_path / "beside" / "master" / "snapshots"
+    assert {path.name: path.read_bytes() for path in beside.iterdir()} == {
+        name: contents[name] for name in names[:2]
+    }
 
 
 async def test_parts_of_a_state_are_refused(tmp_path: Path) -> None:
