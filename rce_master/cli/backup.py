@@ -16,7 +16,7 @@ from rce.model import about
 from rce.tls.choice import TlsChoice
 from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import find_folder, find_state, give_to_owner, read_etcd
+from rce_master.cli.offline import certificates_of, find_folder, find_state, give_to_owner, read_etcd
 from rce_master.etcd_backup import exported, restore_to_etcd
 from rce_master.exceptions import StoreError
 
@@ -124,7 +124,7 @@ def _place(config: Path | None, state_dir: Path | None, store: str) -> _Place:
     etcd = address if isinstance(address, EtcdAddress) else None
     if etcd is not None and state_dir is not None:
         master = find_folder(state_dir.absolute())
-        certificates = _certificates_of(master, settings)
+        certificates = certificates_of(master, settings)
         folders = {MASTER: master, CERTIFICATES: certificates}
         return _Place(folders, etcd, replace(tls, folder=certificates))
     return _Place(_folders(settings, state_dir), etcd, tls)
@@ -142,11 +142,3 @@ def _folders(settings: EngineSettings, state_dir: Path | None) -> dict[str, Path
     if folder == state_dir.absolute():
         return {MASTER: folder}  # a folder that `rce-master --state-dir` was given
     return {MASTER: folder, CERTIFICATES: structs.replace(settings, state_dir=folder.parent).certificates}
-
-
-def _certificates_of(master: Path, settings: EngineSettings) -> Path:
-    """Find the certificates of a master: those of the settings, or in its folder or the engine's."""
-    inside = master / CERTIFICATES
-    if settings.tls.certificates is None and inside.is_dir():
-        return inside
-    return structs.replace(settings, state_dir=master.parent).certificates

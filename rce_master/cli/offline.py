@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec import structs
 
 from rce.config import (
     MASTER_FOLDER,
@@ -26,7 +27,7 @@ from rce.config import (
     read_store_address,
 )
 from rce.tls import CertificateError
-from rce.tls.choice import TlsChoice
+from rce.tls.choice import FOLDER, TlsChoice
 from rce_master.audit import AUDIT, AuditLog
 from rce_master.cli import credentials
 from rce_master.cli.exceptions import CliError, NotLoggedInError
@@ -41,6 +42,7 @@ from rce_master.store.etcd.layout import prepare
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+    from rce.config import EngineSettings
     from rce_master.cli.credentials import Credentials
     from rce_master.state.commands import Command
 
@@ -115,6 +117,19 @@ def find_folder(state_dir: Path) -> Path:
     """
     inner = state_dir / MASTER_FOLDER
     return inner if inner.is_dir() else state_dir
+
+
+def certificates_of(master: Path, settings: EngineSettings) -> Path:
+    """Find the certificates of a master whose store is in etcd.
+
+    Args:
+        master: Its folder.
+        settings: Name the folder of certificates; else it is in the master's folder, or in the engine's.
+    """
+    inside = master / FOLDER
+    if settings.tls.certificates is None and inside.is_dir():
+        return inside
+    return structs.replace(settings, state_dir=master.parent).certificates
 
 
 class OfflineState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from rce.config import (
 from rce.tls.choice import TlsChoice
 from rce_master.cli.client import run
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import find_folder, find_state, give_to_owner, open_store
+from rce_master.cli.offline import certificates_of, find_folder, find_state, give_to_owner, open_store
 from rce_master.exceptions import StoreBusyError
 from rce_master.packages.carrying import carry, packages_of, states_of
 from rce_master.snapshots.carrying import carry_snapshots
@@ -48,22 +49,27 @@ def copy(
             help="State folder of this machine's master on etcd: holds packages and snapshots.",
         ),
     ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings file: names that folder, and certificates.")
+    ] = None,
 ) -> None:
     """Copy the state of a master to an empty store, while no master runs on either."""
-    run(_copy(source, target, None if state_dir is None else find_folder(state_dir.absolute())))
+    run(_copy(source, target, None if state_dir is None else find_folder(state_dir.absolute()), config))
 
 
-async def _copy(source: str, target: str, state_dir: Path | None) -> None:
+async def _copy(source: str, target: str, state_dir: Path | None, config: Path | None) -> None:
     here, there = _read(source, "--from"), _read(target, "--to")
     if here == there:
         raise CliError("--from and --to name the same store")
     if not isinstance(here, EtcdAddress) and not (here / STORE_FILE).exists():
         raise CliError(f"--from names {here}, which holds no state: it has no {STORE_FILE}")
     try:
-        settings = load_settings(None)
-        tls = TlsChoice.of(settings)
+        settings = load_settings(config)
     except ConfigError as error:
         raise CliError(str(error)) from error
+    tls = TlsChoice.of(settings)
+    if state_dir is not None:
+        tls = replace(tls, folder=certificates_of(state_dir, settings))
     beside_etcd = settings.master_state if state_dir is None else state_dir
     folder, new_folder = (beside_etcd if isinstance(one, EtcdAddress) else one for one in (here, there))
     async with AsyncExitStack() as stack:

@@ -9,10 +9,13 @@ import msgspec
 import pytest
 from msgspec import structs
 from support.etcd import cluster
+from support.go_between import LOOPBACK
 from support.master_program import rce
 
 from rce.config import STORE_FILE, EngineSettings, MasterSettings
 from rce.control.snapshots import FileEntry, Manifest
+from rce.tls.folder import CertificateFolder
+from rce.tls.identity import TlsFiles, TlsIdentity
 from rce_master.state.tables import Tables
 from rce_master.state.user_records import UserPackage
 from rce_master.state.volume_records import UserVolume
@@ -161,6 +164,26 @@ async def test_snapshots_of_volumes_move_too(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in beside.iterdir()} == {
         name: contents[name] for name in names[:2]
     }
+
+
+async def test_state_is_copied_to_etcd_over_tls(tmp_path: Path) -> None:
+    """The certificates are where ``rce cluster`` makes them, or where the settings say."""
+    await make_state(tmp_path)
+    folder = CertificateFolder(tmp_path / "machine" / "certificates")
+    folder.make_authority()
+    folder.issue("engine", hosts=[LOOPBACK])
+    certificate, key = folder.certificate("engine"), folder.key("engine")
+    options = [
+        *("--cert-file", str(certificate), "--key-file", str(key)),
+        *("--client-cert-auth", "--trusted-ca-file", str(folder.authority)),
+    ]
+    tls = TlsIdentity(TlsFiles(certificate, key, folder.authority)).client
+    (tmp_path / "engine.yaml").write_text(f"tls: {{certificates: {folder.path}}}\n")
+    async with cluster(tmp_path / "etcd", 1, *options, tls=tls) as etcd:
+        for number, words in enumerate((("--state-dir", "machine"), ("--config", "engine.yaml"))):
+            there = f"etcds://{etcd.endpoints[0]}/{number}"
+            told = await rce(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", there, *words)
+            assert f"copied {MANY + 1} records to {there}" in told
 
 
 async def test_parts_of_a_state_are_refused(tmp_path: Path) -> None:
