@@ -18,7 +18,7 @@ import platformdirs
 import typer
 from msgspec.structs import replace
 
-from rce.config import ConfigError, EngineSettings, default_secret_file, load_settings
+from rce.config import ETCD_FILE, ConfigError, EngineSettings, default_secret_file, load_settings
 from rce.services.units import SYSTEM_STATE, Role, Service, unit
 
 SYSTEM_UNITS = Path("/etc/systemd/system")
@@ -187,7 +187,7 @@ def make_service(
         return Service(
             role=role,
             program=Path(shutil.which("etcd") or _ETCD_PROGRAM),
-            arguments=arguments or ("--config-file", str(state / "etcd.yaml")),
+            arguments=arguments or ("--config-file", str(state / ETCD_FILE)),
             system=system,
             user=run_as if system and run_as != "root" else "",
             state=state / "etcd",

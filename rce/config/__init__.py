@@ -3,6 +3,7 @@
 from rce.config.exceptions import ConfigError, Fault, LogFileError, RunDirError, SecretError, ShippedFileError
 from rce.config.fields import Field, SettingError, fields_of, sections_of
 from rce.config.folders import (
+    ETCD_FILE,
     MASTER_FOLDER,
     STORE_FILE,
     configs_dir,
@@ -25,6 +26,7 @@ from rce.config.store_address import EtcdAddress, SqliteAddress, StoreAddress, r
 
 __all__ = [
     "ANYWHERE",
+    "ETCD_FILE",
     "LOOPBACK",
     "MASTER_FOLDER",
     "STORE_FILE",

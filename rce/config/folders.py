@@ -19,6 +19,8 @@ MASTER_FOLDER = "master"
 """The folder of the master's state in an engine's state folder."""
 STORE_FILE = "rce.sqlite"
 """The file of a master's state, in its folder."""
+ETCD_FILE = "etcd.yaml"
+"""The file with the configuration of a machine's member of etcd, in its engine's state folder."""
 
 _PACKAGE = Path(rce.__file__).resolve().parent
 

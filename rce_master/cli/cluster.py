@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import typer
 
 from rce.cli.service import USER, check, install, is_system, make_service, make_user, systemd_runs
-from rce.config import default_state_dir
+from rce.config import ETCD_FILE, default_state_dir
 from rce.config.store_address import DEFAULT_PREFIX
 from rce.masters import split_addresses
 from rce.own_process import end_signals
@@ -280,7 +280,7 @@ class _Local:
             words = self.machine.master_arguments(_clients(members))
             typer.echo(
                 "run the master:"
-                f" {shlex.join(['rce-master', '--state-dir', str(self.machine.folder), *words])}"
+                f" {shlex.join(['rce-master', '--state-dir', str(self.machine.master), *words])}"
             )
             typer.echo(f"etcd ready: {self.machine.client}")
 
@@ -400,7 +400,7 @@ def _place(etcd: str, state_dir: Path | None, *, tls: bool) -> tuple[list[str], 
     folder = (state_dir or _default_folder()).absolute()
     if etcd:
         return _endpoints(etcd), _contexts(folder / "certificates") if tls else None
-    found = read_config(folder / "etcd.yaml")
+    found = read_config(folder / ETCD_FILE)
     url = urlsplit(str(found["advertise-client-urls"]))
     others = [
         urlsplit(each.partition("=")[2]).hostname or "" for each in str(found["initial-cluster"]).split(",")

@@ -18,6 +18,7 @@ import typer
 from msgspec import structs
 
 from rce.config import (
+    ETCD_FILE,
     MASTER_FOLDER,
     STORE_FILE,
     ConfigError,
@@ -112,11 +113,11 @@ def find_state(state_dir: Path) -> Path:
 def find_folder(state_dir: Path) -> Path:
     """Return the folder of a master whose store is in etcd.
 
-    It is the folder itself (``rce-master --state-dir``), or ``master`` in it, if that is there: there is no
-    store by which to tell them apart.
+    It is the folder itself (``rce-master --state-dir``), or ``master`` in it, if that is there or the folder
+    is of a machine of a cluster (``rce cluster``): there is no store by which to tell them apart.
     """
     inner = state_dir / MASTER_FOLDER
-    return inner if inner.is_dir() else state_dir
+    return inner if inner.is_dir() or (state_dir / ETCD_FILE).exists() else state_dir
 
 
 def certificates_of(master: Path, settings: EngineSettings) -> Path:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from rce.config import ETCD_FILE, MASTER_FOLDER
 from rce.tls.choice import ENGINE
 from rce.tls.folder import CertificateFolder
 from rce_master.cluster.members import ClusterError
@@ -90,7 +91,7 @@ class Machine:
     @property
     def config(self) -> Path:
         """The file with etcd's configuration."""
-        return self.folder / "etcd.yaml"
+        return self.folder / ETCD_FILE
 
     @property
     def data(self) -> Path:
@@ -101,6 +102,11 @@ class Machine:
     def certificates(self) -> Path:
         """The folder of certificates."""
         return self.folder / "certificates"
+
+    @property
+    def master(self) -> Path:
+        """The folder of its master."""
+        return self.folder / MASTER_FOLDER
 
     @property
     def _host(self) -> str:

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import yaml
 
+from rce.config import ETCD_FILE
 from rce_master.cluster.client import ClusterClient, ask_all
 from rce_master.cluster.engines import forget_masters, known_masters
 from rce_master.cluster.files import Machine, read_config
@@ -41,7 +42,7 @@ def read_machine(folder: Path) -> tuple[Machine, tuple[Member, ...]]:
     Raises:
         ClusterError: It is in no cluster.
     """
-    found = read_config(folder / "etcd.yaml")
+    found = read_config(folder / ETCD_FILE)
     client = urlsplit(str(found["advertise-client-urls"]))
     peer = urlsplit(str(found["initial-advertise-peer-urls"]))
     if client.hostname is None or client.port is None or peer.port is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shlex
 import shutil
 import ssl
 import sys
@@ -10,6 +12,7 @@ from http import HTTPStatus
 from pathlib import Path
 
 import aiohttp
+import msgspec
 import psutil
 import pytest
 from faults.machines import fetch
@@ -17,6 +20,12 @@ from support.engine import Program, until
 from support.go_between import LOOPBACK
 from support.ports import free_ports
 from support.processes import run_to_end
+
+from rce.config import EngineSettings
+from rce_master.backup import MASTER, back_up
+from rce_master.state.tables import Tables
+from rce_master.state.user_records import UserPackage
+from rce_master.store import Row, SqliteStore
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd"), pytest.mark.timeout(300), pytest.mark.asyncio]
 
@@ -117,6 +126,51 @@ async def test_first_user_is_asked_for_until_there_is_one(tmp_path: Path) -> Non
             assert code == 0, output
         finally:
             await init.program.stop()
+
+
+async def test_archives_are_restored_to_the_folder_of_the_master(tmp_path: Path) -> None:
+    """The master of the machine did not run yet: its folder does not exist."""
+    init = Init(tmp_path, "--no-tls")
+    archive = b"an archive"
+    await make_backup(tmp_path, archive)
+    await init.start()
+    try:
+        store = f"etcd://{LOOPBACK}:{init.client}"
+        words = ("restore", str(tmp_path / "copy.tar"), "--store", store, "--state-dir", str(init.state))
+        code, output = await run_to_end(RCE, *words, env=init.env)
+        assert code == 0, output
+        _, _, told = init.program.output().partition("run the master: ")
+        master = Path(shlex.split(told.splitlines()[0])[2])
+        assert master == EngineSettings(state_dir=init.state).master_state, "where the service has it"
+        assert [path.read_bytes() for path in (master / "bundles").iterdir()] == [archive]
+    finally:
+        await init.program.stop()
+
+
+async def make_backup(folder: Path, archive: bytes) -> None:
+    """Make ``copy.tar`` of a state with a package."""
+    state = folder / "one" / "master"
+    sha256 = hashlib.sha256(archive).hexdigest()
+    package = UserPackage(
+        user="anna",
+        name="tools",
+        version="1.0",
+        sha256=sha256,
+        digest="",
+        key="",
+        signature="",
+        packed=len(archive),
+        size=1,
+        files=1,
+        created=1.0,
+    )
+    store = await SqliteStore.open(state)
+    row = Row(Tables().packages.name, package.id, msgspec.json.encode(package))
+    await store.save([row], await store.begin_term())
+    await store.close()
+    (state / "bundles").mkdir()
+    (state / "bundles" / sha256).write_bytes(archive)
+    back_up({MASTER: state}, folder / "copy.tar")
 
 
 async def test_lost_data_does_not_begin_another_cluster(tmp_path: Path) -> None:
