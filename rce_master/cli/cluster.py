@@ -158,12 +158,19 @@ def remove(
 
 
 @app.command("recover")
-def recover(state_dir: StateDir = None) -> None:
+def recover(
+    state_dir: StateDir = None,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Recover it also if a member that can be reached does not answer."),
+    ] = False,
+) -> None:
     """Make this machine a cluster of its own when most members are lost."""
 
     async def do() -> None:
         machine, known = read_machine((state_dir or _default_folder()).absolute())
-        before = await recover_alone(machine, known, _contexts(machine.certificates) if machine.tls else None)
+        contexts = _contexts(machine.certificates) if machine.tls else None
+        before = await recover_alone(machine, known, contexts, force=force)
         again = "the command that started etcd here" if state_dir else "systemctl start rce-etcd rce-master"
         typer.echo(
             f"{machine.name} is a cluster of its own; its data as it was is in {before}\n"

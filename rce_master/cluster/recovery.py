@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import shutil
 import socket
@@ -14,6 +15,7 @@ from urllib.parse import urlsplit
 import yaml
 
 from rce.config import ETCD_FILE
+from rce.dialing import connect_first, resolve
 from rce_master.cluster.client import ClusterClient, ask_all
 from rce_master.cluster.engines import forget_masters, known_masters
 from rce_master.cluster.files import Machine, read_config
@@ -29,6 +31,10 @@ if TYPE_CHECKING:
     from rce.tls import Context
 
 _PAUSE_S = 0.3
+_CONNECT_S = 5.0
+"""How long another machine may take to accept a connection, or to refuse it."""
+_AWAY = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
+"""What the system says of a machine without etcd, or without a way to it."""
 _LOOPBACK = "127.0.0.1"
 _STOP = (
     "if etcd runs here, stop it and the master first (systemctl stop rce-master rce-etcd; with --foreground:"
@@ -57,7 +63,9 @@ def read_machine(folder: Path) -> tuple[Machine, tuple[Member, ...]]:
     return machine, tuple(members)
 
 
-async def recover(machine: Machine, known: Iterable[Member], tls: Context | None) -> Path:
+async def recover(
+    machine: Machine, known: Iterable[Member], tls: Context | None, *, force: bool = False
+) -> Path:
     """Make a machine's data that of a cluster with one member; return the folder of the data as it was.
 
     This works on a copy, which takes the place of the data at the end.
@@ -66,11 +74,13 @@ async def recover(machine: Machine, known: Iterable[Member], tls: Context | None
         machine: The machine; its etcd does not run.
         known: The members that it knows.
         tls: TLS of requests.
+        force: Recover it also if it is not known whether another member works.
 
     Raises:
-        ClusterError: Another member works, etcd runs here, or the data cannot be used; nothing was changed.
+        ClusterError: Another member works or may work, etcd runs here, or the data cannot be used; nothing
+            was changed.
     """
-    await _check_away([each for each in known if each.peer != machine.peer], tls)
+    await _check_away([each for each in known if each.peer != machine.peer], tls, force=force)
     if not machine.data.exists():
         raise ClusterError(f"{machine.data} is missing: restore a backup (rce cluster init, rce restore)")
     try:
@@ -81,7 +91,7 @@ async def recover(machine: Machine, known: Iterable[Member], tls: Context | None
     before = machine.folder / f"etcd.before-{time.strftime('%Y%m%d-%H%M%S')}"
     try:
         await asyncio.to_thread(_copy, machine.data, copy)
-        await _run_alone(machine, copy, tls)
+        await _run_alone(machine, copy, tls, force=force)
         machine.data.rename(before)
         copy.rename(machine.data)
     except OSError as error:
@@ -92,14 +102,42 @@ async def recover(machine: Machine, known: Iterable[Member], tls: Context | None
     return before
 
 
-async def _check_away(others: Sequence[Member], tls: Context | None) -> None:
+async def _check_away(others: Sequence[Member], tls: Context | None, *, force: bool) -> None:
     answers = await ask_all(others, tls)
-    for member in others:
+    signs = await asyncio.gather(*(_sign_of(member) for member in others))
+    for member, sign in zip(others, signs, strict=True):
         if isinstance(answers[member.id], MemberStatus):
             raise ClusterError(
                 f"etcd on {member.shown} ({member.client}) works: start members until more than half work,"
                 " and remove the lost ones; or stop it for good first, and what only it has is lost"
             )
+        if sign and not force:
+            raise ClusterError(
+                f"etcd on {member.shown} ({member.client}) may work: {sign} ({answers[member.id]}). Two"
+                " clusters would go separate ways: look at that machine first; --force if its etcd is ended"
+                " for good"
+            )
+
+
+async def _sign_of(member: Member) -> str:
+    """Return why a member that does not answer may work nevertheless; empty: it is away."""
+    host, _, port = member.client.rpartition(":")
+    try:
+        for address in await resolve(host.strip("[]"), int(port)):
+            try:
+                async with asyncio.timeout(_CONNECT_S):
+                    connected = await connect_first([address])
+            except TimeoutError:  # also that of the system
+                continue
+            except OSError as error:
+                if error.errno not in _AWAY:
+                    raise
+            else:
+                connected.close()
+                return "its port takes connections"
+    except OSError as error:
+        return str(error)
+    return ""
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -111,7 +149,7 @@ def _copy(source: Path, target: Path) -> None:
         os.chown(target / path.relative_to(source), found.st_uid, found.st_gid)
 
 
-async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
+async def _run_alone(machine: Machine, data: Path, tls: Context | None, *, force: bool) -> None:
     """Run etcd on a copy of the data, on ports that no other program knows, until it is the only member."""
     client, peer = _free_port(machine.host), _free_port(_LOOPBACK)
     client_url = f"{machine.scheme}://{_client_of(machine, machine.host, client)}"
@@ -130,7 +168,7 @@ async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
         endpoint = _client_of(machine, machine.host, client)
         async with ClusterClient([endpoint], tls=tls) as alone:
             await _until_alone(alone, machine, process)
-            await _forget_other_masters(alone, machine, tls)
+            await _forget_other_masters(alone, machine, tls, force=force)
     finally:
         await end_etcd(process)
         config.unlink(missing_ok=True)
@@ -152,11 +190,13 @@ async def _until_alone(client: ClusterClient, machine: Machine, process: asyncio
     raise ClusterError(f"etcd did not become a cluster of its own: {why}; its output says more")
 
 
-async def _forget_other_masters(client: ClusterClient, machine: Machine, tls: Context | None) -> None:
+async def _forget_other_masters(
+    client: ClusterClient, machine: Machine, tls: Context | None, *, force: bool
+) -> None:
     """Remove what etcd knows of masters on other machines, so that packages do not wait for them.
 
     Raises:
-        ClusterError: etcd works on one of these machines, which joined later than this one.
+        ClusterError: etcd works, or may work, on one of these machines, which joined later than this one.
     """
     others = [one for one in await known_masters(client) if one.host != machine.host]
     places = {one.host: one.name.rpartition(":")[0] for one in others}
@@ -166,6 +206,7 @@ async def _forget_other_masters(client: ClusterClient, machine: Machine, tls: Co
             for number, (host, name) in enumerate(places.items(), 1)
         ],
         tls,
+        force=force,
     )
     await forget_masters(client, others)
 
