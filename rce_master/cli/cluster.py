@@ -34,7 +34,7 @@ from rce_master.cluster.joining import (
     request_membership,
     wait_for_vote,
 )
-from rce_master.cluster.members import ClusterError
+from rce_master.cluster.members import ClusterError, UnknownMemberError
 from rce_master.cluster.process import find_etcd, start_etcd, until_ends
 from rce_master.cluster.recovery import read_machine
 from rce_master.cluster.recovery import recover as recover_alone
@@ -145,9 +145,16 @@ def remove(
     async def do() -> None:
         endpoints, contexts = _place(etcd, state_dir, tls=tls)
         async with await cluster_client(endpoints, contexts) as client:
-            leaving, others = await remove_member(client, name, contexts, force=force)
-            typer.echo(f"removed {leaving.shown}; {hint(others)}")
-            for master in await forget_machine(client, leaving):
+            try:
+                leaving, others = await remove_member(client, name, contexts, force=force)
+            except UnknownMemberError:
+                if not (masters := await forget_machine(client, name)):
+                    raise
+                typer.echo(f"etcd has no member {name}: it was removed before")
+            else:
+                typer.echo(f"removed {leaving.shown}; {hint(others)}")
+                masters = await forget_machine(client, leaving.name, leaving.host)
+            for master in masters:
                 typer.echo(f"the other masters do not count {master} any more")
         typer.echo(
             "on that machine, if it is there: rce uninstall-service master; rce uninstall-service etcd; then"

@@ -171,7 +171,8 @@ async def remove_member(
         The removed member, and the others.
 
     Raises:
-        ClusterError: There is no such member, or the cluster would lose its quorum.
+        UnknownMemberError: There is no such member.
+        ClusterError: The cluster would lose its quorum.
         EtcdError: etcd does not answer, or refused.
     """
     members = await client.members()
@@ -200,12 +201,13 @@ async def remove_member(
     return leaving, tuple(each for each in members if each.id != leaving.id)
 
 
-async def forget_machine(client: ClusterClient, leaving: Member) -> list[str]:
+async def forget_machine(client: ClusterClient, name: str, host: str = "") -> list[str]:
     """Remove what etcd knows of the masters of a machine, of all engines that it keeps.
 
     Args:
         client: A client of all members.
-        leaving: The machine's member of etcd.
+        name: The machine's name.
+        host: Its address; empty if it is not known.
 
     Returns:
         Their names.
@@ -216,7 +218,7 @@ async def forget_machine(client: ClusterClient, leaving: Member) -> list[str]:
     gone = [
         one
         for one in await known_masters(client)
-        if one.name.rpartition(":")[0] == leaving.name or one.host == leaving.host
+        if (name and one.name.rpartition(":")[0] == name) or (host and one.host == host)
     ]
     await forget_masters(client, gone)
     return [one.shown for one in gone]

@@ -22,6 +22,10 @@ class ClusterError(MasterError):
     """A change of the cluster was refused, or failed; the text says what to do."""
 
 
+class UnknownMemberError(ClusterError):
+    """The cluster has no member of that name."""
+
+
 @dataclass(frozen=True, slots=True)
 class Member:
     """A member of etcd, as the cluster knows it."""
@@ -123,13 +127,13 @@ def find(members: Sequence[Member], name: str) -> Member:
     """Return the member of a name, or of a number in hexadecimal digits.
 
     Raises:
-        ClusterError: There is none.
+        UnknownMemberError: There is none.
     """
     for member in members:
         if name in (member.name, f"{member.id:x}"):
             return member
     known = ", ".join(member.shown for member in members)
-    raise ClusterError(f"no member is named {name!r}; members: {known}")
+    raise UnknownMemberError(f"no member is named {name!r}; members: {known}")
 
 
 def check_new(members: Sequence[Member], name: str, client: str, peer: str) -> None:
