@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 CHANGE_S = 10.0
 """How long a change of the members may take."""
+LIST_S = 3.0
+"""How long one member may take to tell of all members, which it does without the others."""
 ANSWER_S = 2.0
 """How long one member may take to tell of itself."""
 
@@ -39,7 +41,7 @@ class ClusterClient(EtcdClient):
         Raises:
             EtcdError: No member answers, or etcd refused.
         """
-        return await self._call("v3/cluster/member/list", {}, read_members, CHANGE_S)
+        return await self._call("v3/cluster/member/list", {}, read_members, LIST_S)
 
     async def add_learner(self, peer_url: str) -> tuple[Member, ...]:
         """Add a member that has no vote until it is promoted; return all members.

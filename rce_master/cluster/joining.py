@@ -227,17 +227,17 @@ async def forget_machine(client: ClusterClient, name: str, host: str = "") -> li
 async def cluster_client(endpoints: Sequence[str], tls: Context | None) -> ClusterClient:
     """Return a client of all members, once one of some was asked for them; without those that have no vote.
 
+    It asks the member first that answered: each one before it that is silent would take time again.
+
     Raises:
         EtcdError: None of them answers.
     """
     async with ClusterClient(endpoints, tls=tls, attempt=_REACH_S) as first:
         members = await first.members()
+        ordered = dict.fromkeys([first.in_use, *endpoints])
     known = [each.client for each in members if each.client and not each.is_learner]
-    ordered = [
-        *(each for each in endpoints if each in known),
-        *(each for each in known if each not in endpoints),
-    ]
-    return ClusterClient(ordered or endpoints, tls=tls, attempt=_REACH_S)
+    found = [*(each for each in ordered if each in known), *(each for each in known if each not in ordered)]
+    return ClusterClient(found or list(ordered), tls=tls, attempt=_REACH_S)
 
 
 def hint(members: Sequence[Member]) -> str:

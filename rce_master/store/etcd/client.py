@@ -139,6 +139,11 @@ class EtcdClient:
     def __str__(self) -> str:
         return ",".join(self._endpoints)
 
+    @property
+    def in_use(self) -> str:
+        """``HOST:PORT`` of the member that answered last, which is asked first."""
+        return self._endpoints[self._current]
+
     async def __aenter__(self) -> Self:
         # The members are named by the operator; a proxy of the environment is for other addresses.
         connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=60.0)
