@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rce.config import LOOPBACK, EngineSettings
+from rce.services.etcd import EtcdProgramError, find_etcd
 from rce.supervision.plan import Program
 from rce.tls.choice import WARNED_VARIABLE
 
@@ -60,10 +60,10 @@ class Replicas:
             raise ReplicasError("--replicas keeps the state in an etcd of its own; leave store out")
         if not (settings.master.http_port and settings.master.control_port):
             raise ReplicasError("--replicas needs known ports: --http-port and --control-port, not 0")
-        program = shutil.which("etcd")
-        if program is None:
-            raise ReplicasError("etcd is not installed, which --replicas needs (Debian: etcd-server)")
-        self._program = program
+        try:
+            self._program = find_etcd()
+        except EtcdProgramError as error:
+            raise ReplicasError(f"--replicas runs etcd: {error}") from None
         self._settings = settings
         self._folder = settings.state_dir.absolute() / "etcd"
         self._members = _members(self._folder, count)

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
-import re
-import shutil
-import subprocess
 from functools import partial
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import cancel_and_wait
+from rce.services import etcd
 from rce.supervision.process import end_with
 from rce_master.cluster.members import ClusterError
-from rce_master.store.etcd.client import MIN_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -24,7 +20,6 @@ if TYPE_CHECKING:
 END_S = 20.0
 """How long etcd may take to end. It waits up to 7 s for its clients and 7 s for a new leader; but release 3.4
 may wait 15 minutes for a member whose machine was lost, and all that it acknowledged is on the disk."""
-_VERSION = re.compile(r"etcd Version: (\d+)\.(\d+)")
 
 
 def find_etcd() -> str:
@@ -33,20 +28,10 @@ def find_etcd() -> str:
     Raises:
         ClusterError: It is not installed, or too old.
     """
-    program = shutil.which("etcd")
-    if program is None:
-        raise ClusterError("etcd is not installed; install release 3.4 or later (Debian: etcd-server)")
-    done = subprocess.run([program, "--version"], check=False, capture_output=True, text=True)  # noqa: S603 - no input
-    found = _VERSION.search(done.stdout)
-    if found is None:
-        raise ClusterError(
-            f"{program} --version does not tell a version of etcd: {json.dumps(done.stdout[:80])}"
-        )
-    version = int(found[1]), int(found[2])
-    if version < MIN_VERSION:
-        needed = ".".join(map(str, MIN_VERSION))
-        raise ClusterError(f"{program} is version {found[1]}.{found[2]}; version {needed} or later is needed")
-    return program
+    try:
+        return etcd.find_etcd()
+    except etcd.EtcdProgramError as error:
+        raise ClusterError(str(error)) from None
 
 
 async def start_etcd(

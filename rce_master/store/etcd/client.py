@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Self, TypeVar
 
 import aiohttp
 
+from rce.services.etcd import MIN_VERSION
 from rce.tls import explain_to_client
 from rce_master.exceptions import StoreError
 from rce_master.store.etcd import wire
@@ -36,8 +37,6 @@ LOAD_S = 20.0
 BYTES_PER_S = 100_000
 """How fast a member takes a request at least. Its gateway reads JSON slowly, and a request that is given up
 before it was read is not done."""
-MIN_VERSION = (3, 4)
-"""The first release whose gateway is below ``/v3``."""
 _OK = 200
 _CANCELLED, _UNKNOWN, _DEADLINE, _EXHAUSTED, _INTERNAL, _UNAVAILABLE = 1, 2, 4, 8, 13, 14
 _UNCERTAIN = frozenset((_CANCELLED, _UNKNOWN, _DEADLINE, _INTERNAL, _UNAVAILABLE))

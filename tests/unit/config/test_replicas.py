@@ -18,9 +18,13 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(autouse=True)
-def etcd(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is started here, so etcd need not be installed."""
-    monkeypatch.setattr("rce.cli.replicas.shutil.which", lambda name: f"/usr/bin/{name}")
+def etcd(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Nothing is started here, so etcd need not be installed: a script tells its version."""
+    program = tmp_path_factory.mktemp("bin") / "etcd"
+    program.write_text("#!/bin/sh\necho 'etcd Version: 3.4.0'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent))
+    return program
 
 
 def settings_of(program: Program) -> dict[str, Any]:
@@ -57,6 +61,13 @@ def test_members_of_etcd_come_first_and_each_master_asks_its_own(tmp_path: Path)
     assert [programs[name].ready for name in masters] == [" ready: ", " stand-by: ", " stand-by: "]
     assert options_of(programs["etcd-m2"])["--data-dir"] == f"{tmp_path}/etcd/m2"
     assert "every user of this machine" in made.warnings[-1]
+
+
+def test_old_etcd_is_refused(etcd: Path, tmp_path: Path) -> None:
+    """It would end by an option that it does not know, and be started again and again."""
+    etcd.write_text("#!/bin/sh\necho 'etcd Version: 3.3.25'\n")
+    with pytest.raises(ReplicasError, match=r"is version 3\.3; version 3\.4 or later is needed"):
+        plan(EngineSettings(state_dir=tmp_path), 3)
 
 
 def test_ports_stay_and_the_number_of_members_too(tmp_path: Path) -> None:
@@ -98,8 +109,8 @@ def test_settings_that_do_not_fit_are_refused(tmp_path: Path, master: MasterSett
         plan(EngineSettings(state_dir=tmp_path, master=master), 3)
 
 
-def test_missing_etcd_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rce.cli.replicas.shutil.which", lambda _: None)
+def test_missing_etcd_is_named(etcd: Path, tmp_path: Path) -> None:
+    etcd.unlink()
     with pytest.raises(ReplicasError, match="etcd is not installed"):
         Replicas(EngineSettings(state_dir=tmp_path), 3)
 
