@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import os
+import time
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import aiohttp
@@ -108,8 +109,8 @@ class Watch:
 class EtcdClient:
     """Speaks with the members of one etcd cluster. An async context manager.
 
-    A member that fails is passed over, and the next one stays in use. Cancelling a call leaves open whether
-    it is done.
+    A member that fails is passed over, and the next one stays in use; calls that wait for the member that
+    failed ask the next one too. Cancelling a call leaves open whether it is done.
 
     Args:
         endpoints: Addresses ``HOST:PORT`` of members; the nearest one first.
@@ -133,6 +134,8 @@ class EtcdClient:
         self._tls = tls
         self._attempt = attempt
         self._current = 0
+        self._unanswered: set[asyncio.Timeout] = set()
+        """Of the calls that wait for the first byte of an answer from the member in use."""
         self._session: aiohttp.ClientSession | None = None
 
     def __str__(self) -> str:
@@ -282,8 +285,8 @@ class EtcdClient:
             text = explain_to_client(error) or str(error) or type(error).__name__
             raise EtcdAwayError([f"{endpoint}: {text}"], maybe_done=False) from error
         finally:
-            if watch.is_given_up and used == self._current:
-                self._current = (used + 1) % len(self._endpoints)
+            if watch.is_given_up:
+                self._pass_over(used)
 
     def uses(self, watch: Watch) -> bool:
         """Return whether requests go to the member of a watch; if not, it has failed since."""
@@ -345,7 +348,7 @@ class EtcdClient:
             used = self._current
             endpoint = self._endpoints[used]
             try:
-                answer = await self._exchange(endpoint, path, body, limit)
+                answer = await self._exchange(endpoint, path, body, limit, self._unanswered)
                 return read(json.loads(answer))
             except (wire.WireError, ValueError) as error:
                 reasons.append(f"{endpoint}: {error}")
@@ -358,16 +361,45 @@ class EtcdClient:
                 if not maybe_done:
                     raise
                 raise EtcdAwayError([*reasons, str(error)], maybe_done=True) from error
-            if used == self._current:  # another call may have passed it over meanwhile
-                self._current = (used + 1) % len(self._endpoints)
+            self._pass_over(used)
         raise EtcdAwayError(reasons, maybe_done=maybe_done)
 
-    async def _exchange(self, endpoint: str, path: str, body: bytes | None, timeout: float) -> bytes:
+    def _pass_over(self, used: int) -> None:
+        """Use the next member, unless another call has done so, and let no call wait for this one."""
+        if used != self._current or len(self._endpoints) == 1:
+            return
+        self._current = (used + 1) % len(self._endpoints)
+        unanswered, self._unanswered = self._unanswered, set()
+        for one in unanswered:
+            if not one.expired():
+                one.reschedule(asyncio.get_running_loop().time())
+
+    async def _exchange(
+        self,
+        endpoint: str,
+        path: str,
+        body: bytes | None,
+        timeout: float,
+        unanswered: set[asyncio.Timeout] | None = None,
+    ) -> bytes:
+        """Do one request at one endpoint.
+
+        Args:
+            endpoint: Its address.
+            path: Of the request.
+            body: What is posted; None: nothing, it is a ``GET``.
+            timeout: Seconds until it is given up.
+            unanswered: Holds the request's timeout until an answer begins.
+        """
         assert self._session is not None
         scheme = "http" if self._tls is None else "https"
+        limit = asyncio.timeout(timeout)
+        unanswered = set() if unanswered is None else unanswered
+        unanswered.add(limit)
+        began = time.monotonic()
         try:
             async with (
-                asyncio.timeout(timeout),
+                limit,
                 self._session.request(
                     "GET" if body is None else "POST",
                     f"{scheme}://{endpoint}/{path}",
@@ -377,18 +409,22 @@ class EtcdClient:
                     allow_redirects=False,
                 ) as response,
             ):
+                unanswered.discard(limit)
                 status, answer = response.status, await response.read()
         except aiohttp.ClientConnectorError as error:
             raise _FailedError(_connect_text(error), maybe_done=False) from error
         except aiohttp.ConnectionTimeoutError:
             raise _FailedError(f"no connection within {self._attempt:.3g} s", maybe_done=False) from None
         except TimeoutError:
-            raise _FailedError(f"no answer within {timeout:.3g} s", maybe_done=True) from None
+            waited = time.monotonic() - began
+            raise _FailedError(f"no answer within {waited:.3g} s", maybe_done=True) from None
         except (aiohttp.ClientError, OSError) as error:
             text = explain_to_client(error) or str(error) or type(error).__name__
             if self._tls is None and isinstance(error, aiohttp.ServerDisconnectedError):
                 text += " (if this etcd uses TLS, name it etcds://)"
             raise _FailedError(text, maybe_done=True) from error
+        finally:
+            unanswered.discard(limit)
         if status == _OK and _ERROR not in answer:
             return answer
         fault = wire.read_fault(answer)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import signal
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,9 @@ from rce_master.store.etcd.layout import Keys, prepare
 from rce_master.store.etcd.wire import Put
 
 PATIENT_S = 20.0
+NEVER_S = 600.0
+"""Longer than a test takes."""
+HEADER = {"header": {"revision": "7"}}
 EXPIRES_AT_ONCE = 1 / 86400
 """Days."""
 
@@ -52,6 +56,21 @@ async def other_server(answers: dict[str, object]) -> AsyncIterator[str]:
         yield f"{LOOPBACK}:{port}"
     finally:
         await runner.cleanup()
+
+
+@contextlib.asynccontextmanager
+async def silent_server() -> AsyncIterator[tuple[str, list[bytes]]]:
+    """Take connections and what they send, and never answer; give the address and what was read."""
+    read: list[bytes] = []
+
+    async def never_answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.closing(writer):
+            while piece := await reader.read(1 << 16):
+                read.append(piece)
+
+    async with await asyncio.start_server(never_answer, LOOPBACK, 0) as server:
+        host, port = server.sockets[0].getsockname()
+        yield f"{host}:{port}", read
 
 
 async def refusal(endpoint: str, prefix: str = "/rce", *, attempt: float = PATIENT_S) -> str:
@@ -138,19 +157,83 @@ async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
 @pytest.mark.needs("etcd")
 async def test_a_silent_member_holds_no_look_at_the_lead(etcd: Cluster) -> None:
     """It was cut off with its machine: connections to it are there, and nothing comes back."""
-    read: list[bytes] = []
-
-    async def never_answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.closing(writer):
-            while piece := await reader.read(1 << 16):
-                read.append(piece)
-
-    async with await asyncio.start_server(never_answer, LOOPBACK, 0) as server:
-        host, port = server.sockets[0].getsockname()
-        endpoints = [f"{host}:{port}", *etcd.endpoints]
+    async with silent_server() as (silent, read):
+        endpoints = [silent, *etcd.endpoints]
         async with EtcdClient(endpoints, attempt=0.2) as client, asyncio.timeout(LOAD_S / 2):
             assert (await EtcdStore(client, "/silent").leadership()).leader is None
     assert read
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        pytest.param(lambda client: client.transact([], [Put("/a", b"a" * 1_000_000)]), id="save"),
+        pytest.param(lambda client: client.range("/", timeout=NEVER_S), id="page"),
+        pytest.param(lambda client: client.grant(5), id="lease"),
+    ],
+)
+async def test_calls_leave_a_member_that_was_passed_over(
+    call: Callable[[EtcdClient], Coroutine[object, object, object]],
+) -> None:
+    """A large save or a page, which may take long, ends with the next member once a small request failed."""
+    answers = {
+        "/v3/kv/txn": {**HEADER, "succeeded": True},
+        "/v3/kv/range": HEADER,
+        "/v3/lease/grant": {"ID": "1", "TTL": "5"},
+    }
+    async with (
+        silent_server() as (silent, read),
+        other_server(answers) as other,
+        EtcdClient([silent, other], attempt=NEVER_S) as client,
+    ):
+        waiting = asyncio.create_task(call(client))
+        await until(lambda: read, what="the silent member has got the request")
+        await client.range("/", timeout=0.1)
+        await asyncio.wait_for(waiting, PATIENT_S)
+
+
+async def test_a_call_that_left_a_member_may_be_done() -> None:
+    """The member may pass it on later, so that another one's refusal does not tell that nothing was done."""
+    refused = {"error": "etcdserver: permission denied", "code": 7}
+    answers = {"/v3/kv/txn": refused, "/v3/kv/range": HEADER}
+    async with (
+        silent_server() as (silent, read),
+        other_server(answers) as other,
+        EtcdClient([silent, other], attempt=NEVER_S) as client,
+    ):
+        saving = asyncio.create_task(client.transact([], [Put("/a", b"a")]))
+        await until(lambda: read, what="the silent member has got the save")
+        await client.range("/", timeout=0.1)
+        with pytest.raises(EtcdAwayError, match="permission denied") as caught:
+            await asyncio.wait_for(saving, PATIENT_S)
+    assert caught.value.maybe_done
+
+
+async def test_a_call_whose_answer_has_begun_stays() -> None:
+    """A member that answers a page slowly is not asked in vain if a small request failed meanwhile."""
+    may_end = asyncio.Event()
+    began = asyncio.Event()
+
+    async def answer_slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.closing(writer):
+            await reader.readuntil(b"/range")
+            page = json.dumps({**HEADER, "count": "9"}).encode()
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % len(page))
+            began.set()
+            await may_end.wait()
+            writer.write(page)
+            await writer.drain()
+
+    async with await asyncio.start_server(answer_slowly, LOOPBACK, 0) as server, other_server({}) as other:
+        host, port = server.sockets[0].getsockname()
+        async with EtcdClient([f"{host}:{port}", other], attempt=NEVER_S) as client:
+            reading = asyncio.create_task(client.range("/", timeout=NEVER_S))
+            await began.wait()
+            with pytest.raises(EtcdAwayError):
+                await client.range("/", timeout=0.1)
+            may_end.set()
+            page = await asyncio.wait_for(reading, PATIENT_S)
+    assert page.count == 9
 
 
 async def check_runtime_faults(client: EtcdClient) -> None:
