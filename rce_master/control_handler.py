@@ -48,7 +48,7 @@ from rce_master.exceptions import (
 from rce_master.quotas import Quotas
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
-from rce_master.state.robots import DRAINED
+from rce_master.state.robots import DRAINED, why_locked_out
 from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
@@ -249,6 +249,7 @@ class ControlHandler:
             robot is not None
             and (robot.task_set, robot.credential) == (command.process, command.credential)
             and tables.robot_live(command.id).session is RobotSession.CONNECTED
+            and not why_locked_out(tables, robot)
         )
 
     async def _admission(self, process: str, id_: str, login: Login) -> commands.RobotLogin:
@@ -292,9 +293,13 @@ class ControlHandler:
 
     async def _request(self, peer: Peer, request: ClientRequest) -> None:
         user = request.id.partition("/")[0]
-        if self._state_service.tables.robot(request.id) is None:
+        robot = self._state_service.tables.robot(request.id)
+        if robot is None:
             error = f"robot {request.id!r} is not known any more; connect again"
             peer.send(ClientReply(request=request.request, errors=(error,)))
+            return
+        if reason := why_locked_out(self._state_service.tables, robot):
+            peer.send(ClientReply(request=request.request, errors=(reason,)))
             return
         try:
             self._quotas.robot_request(self._state_service.tables.users[user], requests.count_items(request))

@@ -14,6 +14,7 @@ from rce_master.state.records import (
     Departure,
     Drain,
     Endpoint,
+    Lockout,
     Move,
     Presence,
     Robot,
@@ -209,6 +210,7 @@ class Transaction:
         | RobotLive
         | ContainerLive
         | Presence
+        | Lockout
         | Tombstone
         | Drain
         | Move
@@ -344,6 +346,7 @@ _TABLES: dict[type, str] = {
     RobotLive: "live",
     ContainerLive: "live",
     Presence: "presence",
+    Lockout: "lockouts",
     Tombstone: "tombstones",
     Drain: "drains",
     Move: "moves",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rce.control import TaskSetKind
 from rce.model import EndpointId, Form, InterfaceType, Network, Resources, Role, split_package
-from rce_master.state import capacity, endpoints
+from rce_master.state import capacity, endpoints, robots
 from rce_master.state.lifecycle import RobotSession, VolumeMovePhase
 from rce_master.state.placement import Room
 from rce_master.state.promises import Promises
@@ -197,8 +197,12 @@ def _check_observed(tables: Tables) -> None:
             assert isinstance(endpoint, Robot), f"{live.id}: a robot's observation of a container"
             assert live.session is not RobotSession.OFFLINE, f"{live.id}: offline robots have no endpoint"
             if live.session is RobotSession.CONNECTED:
-                assert tables.is_connected(endpoint.task_set), (
+                presence = tables.presence.get(endpoint.task_set)
+                assert presence is not None and (presence.connected or presence.leaving), (  # noqa: PT018
                     f"{live.id}: connected at a task set that is away"
+                )
+                assert not robots.why_locked_out(tables, endpoint) or endpoint.user in tables.lockouts, (
+                    f"{live.id}: connected and locked out"
                 )
         else:
             _check_container(tables, live)

@@ -202,6 +202,14 @@ class Presence(Struct, frozen=True, kw_only=True):
     process: str
     connected: bool
     since: float
+    leaving: bool = False
+    """Whether it went away, and some of its robots may still count as connected."""
+
+
+class Lockout(Struct, frozen=True, kw_only=True):
+    """A user some of whose robots may still have sessions that are to end."""
+
+    user: str
 
 
 class Tombstone(Struct, frozen=True, kw_only=True):

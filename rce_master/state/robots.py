@@ -17,7 +17,7 @@ from rce_master.exceptions import (
 )
 from rce_master.state import activity, endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession
-from rce_master.state.records import Robot, RobotLive
+from rce_master.state.records import Lockout, Robot, RobotLive
 from rce_master.state.tables import WAITING
 
 if TYPE_CHECKING:
@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 
 DRAINED = "this robot process is being emptied; connect again"
 """What robots of a drained task set are told."""
-_SENDING_AWAY = 100
-"""The work of sending a robot away, as :attr:`StateSettings.max_work` counts it."""
+_SENDING_AWAY = 50
+"""The work of sending a robot away, as :attr:`StateSettings.max_work` counts it; then of noting that it left,
+and of forgetting one of its interfaces or connections that is in use."""
+_LEAVING = 10
+_FORGETTING = 3
 
 
 def login(tx: Transaction, command: RobotLogin) -> None:
@@ -61,6 +64,8 @@ def login(tx: Transaction, command: RobotLogin) -> None:
         raise ConflictError(
             f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID"
         )
+    else:
+        _settle(tx, there)
     _enter(tx, command)
     tx.changes.answered = command.id
     tx.happen("robot_connected", command.id, f"at {command.process}")
@@ -90,6 +95,8 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
             endpoints.withdraw(tx, robot, "the robot connected elsewhere")
         endpoints.assign(tx, robot, process)
         endpoints.touch_dialers(tx, id_)
+    elif not command.credential and _is_before(tx.tables, robot):
+        endpoints.assign(tx, robot, process)  # it came in by its token before, and now by the new password
     tx.put(replace(tx.tables.endpoints[id_], credential=command.credential))
     tx.put(replace(live.after(RobotEvent.LOGIN, tx.now), status=None))
     activity.forget(tx, id_)
@@ -109,6 +116,75 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
         tx.put(replace(live.after(RobotEvent.LEAVE, tx.now), status=None))
         activity.forget(tx, robot.id)
         tx.happen("robot_left", robot.id, reason)
+
+
+def leave_lost(tx: Transaction) -> None:
+    """Begin the grace time of robots whose task sets went away."""
+    for presence in [one for one in tx.tables.presence if one.leaving]:
+        for robot in tx.tables.endpoints.by("task_set", presence.process):
+            assert isinstance(robot, Robot)
+            if tx.tables.robot_live(robot.id).session is not RobotSession.CONNECTED:
+                continue
+            if tx.is_out_of_work():
+                return
+            tx.spend(_leaving_work(tx.tables, robot.id))
+            _leave_lost(tx, robot)
+        tx.put(replace(presence, leaving=False))
+
+
+def _leave_lost(tx: Transaction, robot: Robot) -> None:
+    leave(tx, robot, f"its task set {robot.task_set!r} is away")
+
+
+def _leaving_work(tables: Tables, id_: str) -> int:
+    return _LEAVING + _FORGETTING * (
+        tables.active.count("endpoint", id_) + tables.open_ends.count("endpoint", id_)
+    )
+
+
+def why_locked_out(tables: Tables, robot: Robot) -> str:
+    """Return why a robot's session has ended, or is about to, because of its user; empty if it has not."""
+    user = tables.users[robot.user]
+    if not robot.task_set:
+        return ""
+    if not user.role.changes:
+        return f"the user's role is {user.role.value} now"
+    return "the password was changed" if not robot.credential and _is_before(tables, robot) else ""
+
+
+def _is_before(tables: Tables, robot: Robot) -> bool:
+    """Tell whether the present task set became responsible for a robot before the password was changed."""
+    return robot.epoch < tables.users[robot.user].password_epoch
+
+
+def lock_out(tx: Transaction, user: str) -> None:
+    """Send those of a user's robots away whose sessions are to end."""
+    tx.put(Lockout(user=user))
+    send_away_locked_out(tx)
+
+
+def send_away_locked_out(tx: Transaction) -> None:
+    """Send robots away that are locked out.
+
+    After a restart of the master it is done when their task sets report them.
+    """
+    for lockout in list(tx.tables.lockouts):
+        for robot in tx.tables.robots(lockout.user):
+            if not (reason := why_locked_out(tx.tables, robot)):
+                continue
+            if tx.is_out_of_work():
+                return
+            tx.spend(_SENDING_AWAY + _leaving_work(tx.tables, robot.id))
+            send_away(tx, robot, reason)
+        tx.delete(tx.tables.lockouts, lockout.user)
+
+
+def _settle(tx: Transaction, robot: Robot) -> None:
+    """Do for a robot what is left to later commands, so that it can log in."""
+    if reason := why_locked_out(tx.tables, robot):
+        send_away(tx, robot, reason)
+    elif robot.task_set and not tx.tables.is_connected(robot.task_set):
+        _leave_lost(tx, robot)
 
 
 def send_away(tx: Transaction, robot: Robot, reason: str, *, elsewhere: bool = False) -> None:
@@ -151,7 +227,7 @@ def empty_drained(tx: Transaction) -> None:
             assert isinstance(robot, Robot)
             if tx.is_out_of_work():
                 return
-            tx.spend(_SENDING_AWAY)
+            tx.spend(_SENDING_AWAY + _leaving_work(tx.tables, robot.id))
             send_away(tx, robot, DRAINED, elsewhere=True)
 
 

@@ -29,8 +29,8 @@ class StateSettings:
     """How long a container stays after a move of it failed, until the next is tried."""
     max_work: int = 10_000
     """How much work that can be continued later a command does, in units of about a microsecond: placing of
-    containers, giving them up with their machine, removing robots that stayed away. Other commands, and all
-    input and output of the master, wait while a command is applied."""
+    containers, giving them up with their machine, removing robots that stayed away, ending the sessions of
+    robots. Other commands, and all input and output of the master, wait while a command is applied."""
     max_robots: int = 2000
     """Of one user."""
     max_containers: int = 1000

@@ -16,6 +16,7 @@ from rce_master.state.records import (
     Drain,
     Endpoint,
     Live,
+    Lockout,
     Move,
     Presence,
     Robot,
@@ -70,6 +71,7 @@ class Tables:
     - ``live``: exactly one record for each endpoint.
     - ``active``, ``open_ends``: only of endpoints of which a status is known.
     - ``presence``: exactly one record for each task set.
+    - ``lockouts``: of users until no session is left that is to end.
     - ``tombstones``: only of connected task sets.
     - ``drains``: also of container task sets that are gone: they may come back.
     - ``moves``: only of containers that are placed, to task sets that are connected.
@@ -183,6 +185,7 @@ class Tables:
             "open_ends", type_=Any, key=lambda o: o.id, persistent=False, endpoint=lambda o: [o.endpoint]
         )
         self.presence = Table[Presence]("presence", type_=Any, key=lambda p: p.process, persistent=False)
+        self.lockouts = Table[Lockout]("lockouts", type_=Any, key=lambda o: o.user, persistent=False)
         self.tombstones = Table[Tombstone](
             "tombstones", type_=Any, key=lambda t: t.key, persistent=False, process=lambda t: [t.process]
         )
@@ -237,6 +240,7 @@ class Tables:
             self.active,
             self.open_ends,
             self.presence,
+            self.lockouts,
             self.tombstones,
             self.moves,
             self.departures,

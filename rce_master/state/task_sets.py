@@ -174,16 +174,15 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
     process = command.process
     if not tx.tables.is_connected(process):
         return
-    tx.put(Presence(process=process, connected=False, since=tx.now))
+    has_robots = tx.tables.task_sets[process].kind is TaskSetKind.ROBOT
+    tx.put(Presence(process=process, connected=False, since=tx.now, leaving=has_robots))
     for tombstone in tx.tables.tombstones.by("process", process):
         tx.delete(tx.tables.tombstones, tombstone.key)
     for departure in list(tx.tables.departures.by("process", process)):
         tx.delete(tx.tables.departures, departure.id)
-    for endpoint in tx.tables.endpoints.by("task_set", process):
-        if isinstance(endpoint, Robot):
-            robots.leave(tx, endpoint, f"its task set {process!r} is away")
     draining.left(tx, process)
     tx.happen("task_set_left", process, user="")
+    robots.leave_lost(tx)
     placing.place_waiting(tx)
 
 
@@ -247,6 +246,9 @@ def _note(
     tx: Transaction, endpoint: Container | Robot, status: EndpointStatus, patch: StatusPatch | None = None
 ) -> None:
     header = without_wiring(status)
+    if isinstance(endpoint, Robot) and (reason := robots.why_locked_out(tx.tables, endpoint)):
+        robots.send_away(tx, endpoint, reason)
+        return
     if isinstance(endpoint, Container):
         containers.reported(tx, endpoint, header)
     else:
@@ -304,6 +306,8 @@ def continue_work(tx: Transaction, _: Continue) -> None:
 
 
 def _advance(tx: Transaction) -> None:
+    robots.send_away_locked_out(tx)
+    robots.leave_lost(tx)
     robots.expire(tx)
     for presence in [one for one in tx.tables.presence if not one.connected]:
         _expire(tx, presence)

@@ -42,6 +42,8 @@ class User(Struct, frozen=True, kw_only=True):
     """argon2 over the SHA-256 hex of the password."""
     created: float
     """Seconds since 1970."""
+    password_epoch: int = 0
+    """A robot with a smaller epoch that came in by password did so by an earlier one."""
 
 
 TOKEN_ID_LENGTH = 12

@@ -33,20 +33,19 @@ def add_user(tx: Transaction, command: AddUser) -> None:
 def set_password(tx: Transaction, command: SetPassword) -> None:
     """Change a password; end the user's logins, and the sessions of robots that came in by the password.
 
-    Tokens of robots and of programs stay: they make the fleet independent of the password.
+    Those sessions can do nothing from now on; how many of them a command ends is limited. Tokens of robots
+    and of programs stay: they make the fleet independent of the password.
     """
     user = _find(tx, command.name)
     if command.former and command.former != user.password:
         raise ConflictError("the password was changed meanwhile; log in with the new one")
-    tx.put(replace(user, password=command.password))
+    tx.put(replace(user, password=command.password, password_epoch=endpoints.new_epoch(tx)))
     _forget_login(tx, user.name)
     for token in tx.tables.tokens.by("user", user.name):
         if not token.scope:
             tokens.forget(tx, token, "the password was changed")
-    for robot in tx.tables.robots(user.name):
-        if not robot.credential:
-            robots.send_away(tx, robot, "the password was changed")
     tx.happen("user_password_changed", user.name, user=user.name)
+    robots.lock_out(tx, user.name)
 
 
 def set_role(tx: Transaction, command: SetRole) -> None:
@@ -56,10 +55,9 @@ def set_role(tx: Transaction, command: SetRole) -> None:
         return
     _keep_an_admin(tx, user)
     tx.put(replace(user, role=command.role))
-    if not command.role.changes:
-        for robot in tx.tables.robots(user.name):
-            robots.send_away(tx, robot, f"the user's role is {command.role.value} now")
     tx.happen("user_role_changed", user.name, command.role.value, user=user.name)
+    if not command.role.changes:
+        robots.lock_out(tx, user.name)
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:

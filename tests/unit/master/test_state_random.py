@@ -208,6 +208,14 @@ class Histories(RuleBasedStateMachine):
     def login(self, process: str, user: str, tag: str) -> None:
         self.do(commands.RobotLogin(process=process, id=f"{user}/{tag}"))
 
+    @rule(user=USERS, password=st.sampled_from(["x", "y"]))
+    def set_password(self, user: str, password: str) -> None:
+        self.do(commands.SetPassword(name=user, password=password))
+
+    @rule(user=USERS, role=st.sampled_from([UserRole.ADMIN, UserRole.VIEWER]))
+    def set_role(self, user: str, role: UserRole) -> None:
+        self.do(commands.SetRole(name=user, role=role))
+
     @rule(process=ROBOT_SETS, user=USERS, tag=TAGS)
     def robot_leaves(self, process: str, user: str, tag: str) -> None:
         self.do(commands.RobotLeft(process=process, id=f"{user}/{tag}"))
