@@ -48,6 +48,40 @@ class Offer(NamedTuple):
     """Bytes."""
 
 
+class _Order:
+    """Open machines in the order of their load, the least loaded first.
+
+    Args:
+        loads: By process.
+    """
+
+    def __init__(self, loads: Mapping[str, float]) -> None:
+        self._loads = dict(loads)
+        self._sorted = sorted((load, process) for process, load in loads.items())
+
+    def __contains__(self, process: str) -> bool:
+        return process in self._loads
+
+    def __len__(self) -> int:
+        return len(self._sorted)
+
+    def __iter__(self) -> Iterator[str]:
+        return (process for _, process in self._sorted)
+
+    def put(self, process: str, load: float | None) -> None:
+        """Note the load of a machine; None: it is not open."""
+        before = self._loads.pop(process, None)
+        if before is not None:
+            del self._sorted[bisect_left(self._sorted, (before, process))]
+        if load is not None:
+            self._loads[process] = load
+            insort(self._sorted, (load, process))
+
+    def of(self, among: Iterable[str]) -> _Order:
+        """Return the order of some of the machines."""
+        return _Order({process: self._loads[process] for process in among if process in self._loads})
+
+
 class Rooms:
     """The rooms of all container machines, and what is promised to users.
 
@@ -85,8 +119,11 @@ class Rooms:
         self._promises = Promises()
         self._of_users: dict[str, dict[str, int]] = {}
         self._rooms: dict[str, Room] = {}
-        self._order: list[tuple[float, str]] = []
-        self._places: dict[str, float] = {}
+        self._order = _Order({})
+        self._among: Collection[str] | None = None
+        """Of which machines the order was asked for last: as a rule those that are offered in a pass."""
+        self._part: frozenset[str] = frozenset()
+        self._part_order = _Order({})
         self._draining: dict[str, None] = {}
         self._stale: dict[str, None] = {}
         self._offered: Offer | None = None
@@ -145,7 +182,7 @@ class Rooms:
     def order(self) -> list[str]:
         """The processes of the open machines, the least loaded first."""
         self._fresh()
-        return [process for _, process in self._order]
+        return list(self._order)
 
     @property
     def promises(self) -> Promises:
@@ -172,7 +209,7 @@ class Rooms:
         Args:
             requested: What the container asks for.
             admits: Tells whether the machine of a process may be taken.
-            among: Only these processes; None: all.
+            among: Only these processes; None: all. Many are put in order once: they must not change.
             near: Processes that are returned too, whatever their load is.
             most: So many, and those of ``near``.
         """
@@ -187,7 +224,7 @@ class Rooms:
                 if len(found) >= most:
                     break
         for process in near:
-            if process in found or process not in self._places:
+            if process in found or process not in self._order:
                 continue
             if among is not None and process not in among:
                 continue
@@ -199,9 +236,12 @@ class Rooms:
     def _in_order(self, among: Collection[str] | None) -> Iterable[str]:
         """Return the processes of open machines, the least loaded first."""
         if among is None:
-            return (process for _, process in self._order)
-        places = self._places
-        return (process for _, process in sorted((places[one], one) for one in among if one in places))
+            return self._order
+        if len(among) <= CANDIDATES:
+            return self._order.of(among)
+        if among is not self._among:
+            self._among, self._part, self._part_order = among, frozenset(among), self._order.of(among)
+        return self._part_order
 
     # Following the tables
 
@@ -296,22 +336,22 @@ class Rooms:
         return self._rooms
 
     def _make(self, process: str) -> None:
-        place = self._places.pop(process, None)
-        if place is not None:
-            del self._order[bisect_left(self._order, (place, process))]
         self._draining.pop(process, None)
         task_set = self._task_sets.get(process)
         if task_set is None or task_set.kind is not TaskSetKind.CONTAINER:
             self._rooms.pop(process, None)
+            self._put(process, None)
             return
         room = self._rooms[process] = self._room(task_set)
-        if not self._is_connected(process):
-            return
-        if room.draining:
+        is_connected = self._is_connected(process)
+        self._put(process, room.load_with(_ONE_MORE) if is_connected and not room.draining else None)
+        if is_connected and room.draining:
             self._draining[process] = None
-        else:
-            self._places[process] = place = room.load_with(_ONE_MORE)
-            insort(self._order, (place, process))
+
+    def _put(self, process: str, load: float | None) -> None:
+        self._order.put(process, load)
+        if process in self._part:
+            self._part_order.put(process, load)
 
     def _room(self, task_set: TaskSet) -> Room:
         process, machine = task_set.process, task_set.machine

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from random import Random
 
 import pytest
@@ -15,7 +16,8 @@ from rce.model.volumes import Volume
 from rce_master.exceptions import RefusedError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
-from rce_master.state.rooms import CANDIDATES
+from rce_master.state.placement import Room
+from rce_master.state.rooms import CANDIDATES, Rooms
 from rce_master.state.settings import StateSettings
 
 MB = 1 << 20
@@ -139,6 +141,62 @@ def test_containers_are_spread_over_many_machines(world: World) -> None:
     for number in range(3 * count):
         world.state.apply(_create(number, Resources()), world.now)
     assert set(Counter(places(world)).values()) == {3}
+
+
+def test_a_create_looks_at_few_of_many_machines(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a create costs does not grow with the number of machines, nor of containers on them."""
+    calls: Counter[str] = Counter()
+
+    def count(owner: type, name: str) -> None:
+        counted = getattr(owner, name)
+
+        def call(*args: object) -> object:
+            calls[name] += 1
+            return counted(*args)
+
+        monkeypatch.setattr(owner, name, call)
+
+    machines = 12 * CANDIDATES
+    for number in range(machines):
+        world.state.apply(_machine(f"m{number}", slots=4), world.now)
+    world.state.apply(_create(0, Resources()), world.now)
+    count(Room, "fits")
+    count(Rooms, "_make")
+    for number in range(1, 3 * machines):
+        calls.clear()
+        world.state.apply(_create(number, Resources()), world.now)
+        assert 0 < calls["fits"] <= CANDIDATES + 4
+        assert 0 < calls["_make"] <= 2
+
+
+def test_offered_machines_are_put_in_order_once(world: World) -> None:
+    """A pass that offers many asks for their order for each container, while their loads change."""
+    machines = [f"m{number}" for number in range(4 * CANDIDATES)]
+    for name in machines:
+        world.state.apply(_machine(name, slots=4), world.now)
+    offered = _Offered(dict.fromkeys(machines[::2]))
+    rooms = world.state.tables.rooms
+    for number in range(len(machines)):
+        found = rooms.candidates(Resources(), lambda _: True, among=offered)
+        open_ = [room for process in offered if (room := rooms.get(process)) is not None]
+        least = sorted((room.load_with(Resources()), room.process) for room in open_ if not room.draining)
+        assert [room.process for room in found.rooms] == [process for _, process in least[:CANDIDATES]]
+        if number == 0:
+            offered.asked = 0
+        world.state.apply(_create(number, Resources()), world.now)
+        if number % 10 == 0:
+            world.state.apply(commands.SetDraining(machine=machines[number], draining=True), world.now)
+    assert offered.asked == len(machines) - 1, "by this test alone"
+
+
+class _Offered(dict[str, None]):
+    """Counts how often all machines of it were looked at."""
+
+    asked = 0
+
+    def __iter__(self) -> Iterator[str]:
+        self.asked += 1
+        return super().__iter__()
 
 
 def test_candidates_fill_as_well_as_all_machines_do() -> None:
