@@ -9,14 +9,19 @@ import typer.main
 from typer.testing import CliRunner
 
 from rce.cli.up import OPTIONS as UP
+from rce.config import Secret
 from rce.config.folders import configs_dir
 from rce.config.settings import EngineSettings, Runtime
+from rce_container import app as container_app
 from rce_container.command import OPTIONS as CONTAINER
 from rce_container.command import app as container
+from rce_container.settings import ContainerSettings
 from rce_master.command import OPTIONS as MASTER
 from rce_master.command import app as master
+from rce_robot import app as robot_app
 from rce_robot.command import OPTIONS as ROBOT
 from rce_robot.command import app as robot
+from rce_robot.settings import RobotSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,6 +80,40 @@ def test_container_takes_its_settings_from_the_file(file: str) -> None:
     assert str(found.container_state) == "/var/lib/rce/container"
     assert (own.slots, own.slot_memory, own.home_size) == (12, 1 << 30, 256 << 20)
     assert own.allow_requirements
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "masters: [a.example, 'b.example:82', '[::1]:83', '::2']",
+        "masters: 'a.example, b.example:82,[::1]:83 , ::2'",
+        "master_host: [a.example, 'b.example:82', '[::1]:83', '::2']",
+        "master_host: a.example,b.example:82,[::1]:83,::2",
+    ],
+    ids=["masters, list", "masters, commas", "master_host, list", "master_host, commas"],
+)
+def test_task_sets_dial_all_masters_of_the_file(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "engine.yaml"
+    path.write_text(f"{text}\nmaster: {{control_port: 81}}\n")
+    secret = Secret("secret of the tests")
+    found = settings(ROBOT, robot, "--config", str(path))
+    robots = robot_app.App(
+        master=found.master_host,
+        control_port=found.master.control_port,
+        secret=secret,
+        packages=(),
+        settings=RobotSettings(),
+    )
+    assert robots._places == [("a.example", 81), ("b.example", 82), ("::1", 83), ("::2", 81)]
+    found = settings(CONTAINER, container, "--config", str(path))
+    containers = container_app.App(
+        master=found.master_host,
+        control_port=found.master.control_port,
+        secret=secret,
+        settings=ContainerSettings(machine="m"),
+    )
+    addresses = ("ws://a.example:81", "ws://b.example:82", "ws://[::1]:83", "ws://[::2]:81")
+    assert containers._masters(None).all == addresses
 
 
 def test_master_takes_its_settings_from_the_file(file: str) -> None:
