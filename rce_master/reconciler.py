@@ -41,7 +41,7 @@ from rce.control import (
 from rce_master.exceptions import MasterError, NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.reports import Report, ReportQueue
-from rce_master.state import commands, volume_moves
+from rce_master.state import commands, task_sets, volume_moves
 from rce_master.state.lifecycle import RobotSession
 from rce_master.usage import UsageBook
 
@@ -122,7 +122,9 @@ class Reconciler:
         self._arriving[process] = peer
         self._reports.forget(process)
         try:
-            await self._state_service.submit(commands.TaskSetArrived(hello=hello))
+            outcomes = await self._state_service.submit_all(task_sets.arrival(hello))
+            if (refusal := outcomes[0]) is not None:
+                raise refusal
         except MasterError as error:
             if process not in self._peers and self._state_service.tables.is_connected(process):
                 # Its last departure is not stored yet.

@@ -241,6 +241,15 @@ class TaskSetArrived(Struct, frozen=True, kw_only=True):
     """A task set connected."""
 
     hello: Hello
+    robots_follow: bool = False
+    """Whether :class:`RobotsFound` commands come right behind with what it says of its robots."""
+
+
+class RobotsFound(Struct, frozen=True, kw_only=True):
+    """A task set that connected has these robots."""
+
+    process: str
+    statuses: tuple[EndpointStatus, ...]
 
 
 class TaskSetLeft(Struct, frozen=True, kw_only=True):
@@ -465,6 +474,7 @@ Command: TypeAlias = (
     | SaveState
     | RemoveState
     | TaskSetArrived
+    | RobotsFound
     | TaskSetLeft
     | StatusReported
     | StatusPatched

@@ -64,6 +64,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.SaveState: saved_states.save,
     commands.RemoveState: saved_states.remove,
     commands.TaskSetArrived: task_sets.arrived,
+    commands.RobotsFound: task_sets.robots_found,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,
     commands.StatusPatched: task_sets.status_patched,

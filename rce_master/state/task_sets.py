@@ -27,6 +27,7 @@ from rce_master.state import (
     volume_moves,
     volumes,
 )
+from rce_master.state.commands import RobotsFound, TaskSetArrived
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
     Container,
@@ -50,14 +51,31 @@ if TYPE_CHECKING:
         SpecRequested,
         StatusPatched,
         StatusReported,
-        TaskSetArrived,
         TaskSetLeft,
         Tick,
     )
 
 _LOSS = 200
 """The work of giving up a container, as :attr:`StateSettings.max_work` counts it."""
+_PIECE = 1000
+"""Robots, and their interfaces and connections, that a command takes of a task set that arrived."""
 _PROCESS = re.compile(r"[^\s\x00-\x1f\x7f]{1,255}")
+
+
+def arrival(hello: Hello) -> list[TaskSetArrived | RobotsFound]:
+    """Return the commands that take a task set: of one with many robots several, none of which takes long."""
+    pieces: list[list[EndpointStatus]] = []
+    size = _PIECE
+    for status in hello.endpoints:
+        if size >= _PIECE:
+            pieces.append([])
+            size = 0
+        pieces[-1].append(status)
+        size += 1 + len(status.interfaces) + len(status.connections)
+    if hello.kind is not TaskSetKind.ROBOT or len(pieces) <= 1:
+        return [TaskSetArrived(hello=hello)]
+    found = (RobotsFound(process=hello.process, statuses=tuple(piece)) for piece in pieces)
+    return [TaskSetArrived(hello=hello, robots_follow=True), *found]
 
 
 def arrived(tx: Transaction, command: TaskSetArrived) -> None:
@@ -66,8 +84,9 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
     _check_name(tx, hello)
     _register(tx, hello)
     running = {status.id: status for status in hello.endpoints}
-    for status in hello.endpoints:
-        _adopt(tx, hello.process, status)
+    if not command.robots_follow:
+        for status in hello.endpoints:
+            _adopt(tx, hello.process, status)
     for endpoint in tx.tables.endpoints.by("task_set", hello.process):
         if endpoint.id not in running:
             _miss(tx, endpoint)
@@ -81,6 +100,15 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
     volume_moves.found_again(tx, hello.process)
     tx.changes.arrived = hello.process
     placing.place_waiting(tx)
+
+
+def robots_found(tx: Transaction, command: RobotsFound) -> None:
+    """Take robots of a task set that has arrived, unless it was refused."""
+    task_set = tx.tables.task_sets.get(command.process)
+    if task_set is None or task_set.kind is not TaskSetKind.ROBOT:
+        return
+    for status in command.statuses:
+        _adopt(tx, command.process, status)
 
 
 def _check_name(tx: Transaction, hello: Hello) -> None:

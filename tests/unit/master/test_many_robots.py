@@ -1,4 +1,4 @@
-"""Sessions of many robots that end at once: in slices, as if each had ended with the first."""
+"""Sessions of many robots that end or come back at once: in slices, as if each had done so with the first."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from support.master_cloud import Cloud
 from support.master_world import World, restarted
 from support.state_reports import kinds, status
 
-from rce.control.messages import Drop
+from rce.control.messages import CONTROL_VERSION, Drop, Hello, MachineInfo, Status, TaskSetKind
 from rce_master.exceptions import ConflictError
-from rce_master.state import commands
+from rce_master.state import commands, task_sets
 from rce_master.state.changes import Changes
 from rce_master.state.settings import StateSettings
 from rce_master.state.user_records import Token, UserRole
@@ -133,6 +133,47 @@ def test_a_robot_of_a_token_that_uses_the_new_password_stays(world: World) -> No
     assert world.session() == "connected"
     with pytest.raises(ConflictError, match="connected already"):
         world.login()
+
+
+async def test_many_robots_of_a_task_set_come_back_in_slices(cloud: Cloud) -> None:
+    parts = dict.fromkeys((f"i{number}" for number in range(100)), True)
+    there = [status(f"rob{number}", interfaces=parts) for number in range(ROBOTS)]
+    robots = cloud.robots()
+    await robots.hello()
+    for one in (*there, status("lost")):
+        await cloud.state_service.submit(commands.RobotLogin(process="r1", id=one.id))
+        await robots.say(Status(status=one))
+    await cloud.control_handler.on_gone(robots)
+    back: list[int] = []
+    cloud.state_service.listeners.append(lambda changes: back.append(kinds(changes).count("robot_connected")))
+    sync = await cloud.robots().hello(*there)
+    assert len(sync.endpoints) == ROBOTS + 1
+    assert max(back) < ROBOTS / 2
+    assert sum(back) == ROBOTS
+    tables = cloud.state_service.tables
+    found = [tables.robot_live(robot.id).session.value for robot in tables.robots("anna")]
+    assert found == ["connected"] * ROBOTS + ["absent"]
+    assert len(tables.active) == ROBOTS * len(parts)
+
+
+def test_a_refused_task_set_brings_no_robots(world: World) -> None:
+    world.wired()
+    world.run()
+    found = status("c", interfaces=dict.fromkeys((f"i{number}" for number in range(3000)), True))
+    hello = Hello(
+        version=CONTROL_VERSION,
+        kind=TaskSetKind.ROBOT,
+        process="c1",
+        machine=MachineInfo(name="m"),
+        endpoints=(found, found),
+    )
+    first, *rest = task_sets.arrival(hello)
+    assert len(rest) == 2
+    with pytest.raises(ConflictError, match="container task set 'c1' already"):
+        world.do(first)
+    for command in rest:
+        world.do(command)
+    assert not world.state.tables.active
 
 
 async def test_a_locked_out_robot_asks_for_nothing(cloud: Cloud) -> None:
