@@ -5,6 +5,10 @@ Machines are simulated: their task sets are commands to the state, and no proces
 machine takes. ``lost`` is a machine that stayed away, from the tick that gives up its containers until all of
 them have another machine, in slices of one command each; ``rack`` are 40 at once.
 
+``holds`` is how long a command holds the master's event loop that concerns all robots of a large user, with
+interfaces and connections in use, or a full queue when all machines come back, and each of its slices;
+without the collections of garbage that fall into one of them by chance.
+
 Times are those of the processor that the thread used, so that other load does not count.
 """
 
@@ -19,12 +23,19 @@ from typing import Any
 
 from benchmarks.figures import Results, percentile, show
 from benchmarks.targets import beside_targets
-from rce.control import CONTROL_VERSION, EndpointStatus, Hello, MachineInfo, TaskSetKind
+from rce.control import (
+    CONTROL_VERSION,
+    EndpointState,
+    EndpointStatus,
+    Hello,
+    MachineInfo,
+    TaskSetKind,
+)
 from rce.model import InterfaceSpec, NodeSpec, Resources
 from rce_master.exceptions import NoRoomError
-from rce_master.state import commands
+from rce_master.state import commands, task_sets
 from rce_master.state.changes import Changes
-from rce_master.state.core import State
+from rce_master.state.core import State, without_collections
 from rce_master.state.user_records import User, UserRole
 
 SIZES = (10, 100, 1000)
@@ -32,13 +43,18 @@ PER_MACHINE = 100
 SLOTS = 150
 CREATED = 200
 RACK = 40
+ROBOTS = 2000
+IN_USE = 6
+"""Interfaces and connections of each robot."""
+PER_RETURNING = 50
+"""Containers that wait, for each machine."""
 MEGABYTE = 1e6
 
 
 class Cloud:
     """A state with simulated machines and users, one user for each machine."""
 
-    def __init__(self, machines: int) -> None:
+    def __init__(self, machines: int, *, is_away: bool = False) -> None:
         self.machines = machines
         self.state = State()
         self.now = 1000.0
@@ -46,7 +62,8 @@ class Cloud:
         for number in range(machines):
             user = User(name=f"user{number}", role=UserRole.ADMIN, password="", created=0.0)
             self.do(commands.AddUser(user=user))
-            self.arrive(number)
+            if not is_away:
+                self.arrive(number)
 
     def do(self, command: commands.Command) -> Changes:
         """Apply a command and keep its rows."""
@@ -58,7 +75,7 @@ class Cloud:
                 self.rows.setdefault(row.table, {})[row.key] = row.body
         return changes
 
-    def arrive(self, number: int, endpoints: tuple[EndpointStatus, ...] = ()) -> None:
+    def arrive(self, number: int, endpoints: tuple[EndpointStatus, ...] = ()) -> Changes:
         """Let a machine connect."""
         hello = Hello(
             version=CONTROL_VERSION,
@@ -67,7 +84,20 @@ class Cloud:
             machine=MachineInfo(name=f"m{number}", cores=64, memory=2**38, slots=SLOTS),
             endpoints=endpoints,
         )
-        self.do(commands.TaskSetArrived(hello=hello))
+        return self.do(commands.TaskSetArrived(hello=hello))
+
+    def connect_robots(self, count: int, parts: int) -> None:
+        """Let robots of the first user connect, all at one task set."""
+        self.do(commands.TaskSetArrived(hello=_robots()))
+        for number in range(count):
+            tag = f"r{number}"
+            self.do(commands.RobotLogin(process="r", id=f"user0/{tag}"))
+            for part in range(parts):
+                spec = InterfaceSpec(
+                    tag=f"i{part}", type="PublisherConverter", message_type="std_msgs/String"
+                )
+                self.do(commands.AddInterface(user="user0", endpoint=tag, interface=spec))
+            self.do(commands.StatusReported(process="r", status=_in_use(number, parts)))
 
     def create(self, number: int) -> None:
         """Create a container with a node and an interface; users take turns."""
@@ -76,6 +106,15 @@ class Cloud:
         self.do(commands.AddNode(user=user, container=tag, node=NodeSpec(tag="n", pkg="p", exe="e")))
         spec = InterfaceSpec(tag="i", type="PublisherInterface", message_type="std_msgs/String", addr="/x")
         self.do(commands.AddInterface(user=user, endpoint=tag, interface=spec))
+
+    def time(self, *done: commands.Command) -> list[float]:
+        """Apply commands and what they leave over; return the seconds of each slice."""
+        times = []
+        for command in done:
+            began = thread_time()
+            changes = self.state.apply(command, self.now)
+            times += [thread_time() - began, *self.finish(changes)]
+        return times
 
     def finish(self, changes: Changes) -> list[float]:
         """Continue what a command left over; return the seconds of each slice."""
@@ -116,6 +155,74 @@ def measure(machines: int) -> dict[str, dict[str, Any]]:
         "its longest, ms": round(1e3 * max(rack), 1) if rack else "",
     }
     return {"placing": size | placing, "store": size | _load(cloud)}
+
+
+def hold(robots: int, machines: int) -> list[dict[str, Any]]:
+    """Return how long commands hold the event loop that concern many robots, or a full queue."""
+    lost = commands.TaskSetLeft(process="r")
+    changed = commands.SetPassword(name="user0", password="new")
+    rows = []
+    for parts in (0, IN_USE):
+        back = task_sets.arrival(_robots(tuple(_in_use(number, parts) for number in range(robots))))
+        cloud = Cloud(1)
+        cloud.connect_robots(robots, parts)
+        for what, done in (
+            ("robot task set lost", [lost]),
+            ("robot task set back", back),
+            ("password changed", [changed]),
+        ):
+            with without_collections():
+                times = cloud.time(*done)
+            rows.append(_held(f"{what}, {robots} robots, {parts} interfaces each", times))
+    rows.append(_held(f"full queue, {machines} machines return", _return(machines)))
+    return rows
+
+
+def _robots(there: tuple[EndpointStatus, ...] = ()) -> Hello:
+    return Hello(
+        version=CONTROL_VERSION,
+        kind=TaskSetKind.ROBOT,
+        process="r",
+        machine=MachineInfo(name="r"),
+        endpoints=there,
+    )
+
+
+def _in_use(number: int, parts: int) -> EndpointStatus:
+    return EndpointStatus(
+        id=f"user0/r{number}",
+        revision=1,
+        state=EndpointState.RUNNING,
+        interfaces={f"i{part}": True for part in range(parts)},
+        connections=tuple(range(number * parts, (number + 1) * parts)),
+    )
+
+
+def _held(what: str, times: list[float]) -> dict[str, Any]:
+    return {
+        "what": what,
+        "slices": len(times),
+        "sum, ms": round(1e3 * sum(times), 1),
+        "longest, ms": round(1e3 * max(times), 1),
+    }
+
+
+def _return(machines: int) -> list[float]:
+    """Let all machines but a full one come back at once; return the seconds of each command."""
+    cloud = Cloud(machines, is_away=True)
+    cloud.arrive(0)
+    for number in range(SLOTS + machines * PER_RETURNING):
+        command = commands.CreateContainer(user=f"user{number % machines}", tag=f"c{number}", wait=True)
+        cloud.do(command)
+    times = []
+    with without_collections():
+        for number in range(1, machines):
+            began = thread_time()
+            changes = cloud.arrive(number)
+            times.append(thread_time() - began)
+        times += cloud.finish(changes)
+    assert not cloud.state.tables.endpoints.by("task_set", "")
+    return times
 
 
 def _timed(cloud: Cloud, tag: str, size: int = 1) -> float:
@@ -176,10 +283,12 @@ def main() -> None:
     results = Results("scale", quick=options.quick)
     measured = [measure(machines) for machines in (SIZES[:2] if options.quick else SIZES)]
     suites = {name: [rows[name] for rows in measured] for name in ("placing", "store")}
+    suites["holds"] = hold(ROBOTS // 10, SIZES[1]) if options.quick else hold(ROBOTS, SIZES[-1])
     for name, rows in suites.items():
         results.keep(name, rows)
     show("Placing, processor time", suites["placing"])
     show("The store, and the state that is loaded from it", suites["store"])
+    show("How long a command holds the event loop, processor time", suites["holds"])
     if not options.quick:
         show("Beside the targets", list(beside_targets("scale", suites)))
     print("results:", results.save())

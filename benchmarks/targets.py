@@ -275,6 +275,15 @@ _SCALE = [
         ("store", "memory of the tables", "tables, MB", 147, "MB"),
     )
 ]
+_SCALE.append(
+    Target(
+        "the longest that a command of 2000 robots or of a full queue holds the master's loop, CPU",
+        "scale.holds",
+        _greatest("longest, ms"),
+        20,
+        "ms",
+    )
+)
 
 TARGETS = [
     *_ROUND_TRIPS,
