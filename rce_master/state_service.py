@@ -248,6 +248,8 @@ class StateService:
                     await asyncio.sleep(0)
                 jobs = [] if continues else [await self._jobs.get()]
                 await self._work(jobs, takes_more=True, continues=continues)
+                if self._store_fault and _has_tick(jobs):
+                    await self._retry_store()
         except BaseException as error:
             # The servers wait for the commands of their peers while they close.
             self._end = error if isinstance(error, FencedError) else EndedError()
@@ -286,7 +288,7 @@ class StateService:
         finally:
             self._settled.set()
         self._is_unfinished = any(changes.unfinished for changes in done)
-        if continues or any(isinstance(command, Tick) for job in jobs for command in job.commands):
+        if continues or _has_tick(jobs):
             self._max_work = min(self.state.settings.max_work, self._max_work * 2)
         _touch_once(done)
         turn = _Turn()
@@ -334,6 +336,23 @@ class StateService:
         except StoreError as error:
             self._store_fault = str(error)
             raise
+
+    async def _retry_store(self) -> None:
+        """Find out whether a store that refused a write can be written again: the next write may never come.
+
+        Raises:
+            FencedError: This master leads no more.
+        """
+        try:
+            self._check_fence()
+            await self._store.save([], self._term)
+        except StoreError as error:
+            if self._fence is not None and isinstance(error, FencedError):
+                raise
+            self._store_fault = str(error)
+        else:
+            self._store_fault = ""
+            _log.info("the store can be written again")
 
     async def _stand_alone(self, jobs: list[_Job], error: StoreError, *, was_alone: bool) -> None:
         """Do jobs one by one after their common transaction failed: reports need no store.
@@ -399,6 +418,10 @@ async def load_converted(store: Store, term: int) -> Snapshot:
     _log.info("converting the store of an earlier release: %d records", len(rows))
     await store.save(rows, term)
     return await store.load()
+
+
+def _has_tick(jobs: Sequence[_Job]) -> bool:
+    return any(isinstance(command, Tick) for job in jobs for command in job.commands)
 
 
 def _touch_once(done: Sequence[Changes]) -> None:

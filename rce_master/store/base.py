@@ -55,7 +55,7 @@ class Store(Protocol):
         """Write rows, all or none; when this returns, they survive a crash.
 
         Args:
-            rows: What to write.
+            rows: What to write. Without any, try whether the store can be written; no row changes.
             term: The writer's own, as :meth:`begin_term` returned it; 0 if no term was begun yet.
 
         Raises:

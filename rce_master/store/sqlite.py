@@ -35,6 +35,9 @@ INSERT INTO lease VALUES (1, 1 + :above) ON CONFLICT DO UPDATE SET term = max(te
 """
 _PUT = "INSERT INTO record (kind, key, body) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET body = excluded.body"
 _DELETE = "DELETE FROM record WHERE kind = ? AND key = ?"
+_TRIAL = "CREATE TABLE IF NOT EXISTS trial (body BLOB NOT NULL)"
+TRIAL_BYTES = 1 << 18
+"""A disk that has room for less is still full: small rows fit into what the last write left over."""
 
 
 class SqliteStore:
@@ -101,7 +104,7 @@ class SqliteStore:
         return int(row[0]) if row else 0
 
     async def save(self, rows: Sequence[Row], term: int = 0) -> None:
-        """Write rows in one transaction.
+        """Write rows in one transaction; without rows, try whether the file can be written.
 
         Raises:
             StaleTermError: A newer term was begun; nothing was written.
@@ -116,12 +119,20 @@ class SqliteStore:
             if term < newest:
                 await self._roll_back()
                 raise StaleTermError(term, newest)
+            if not rows:
+                await self._try_to_write()
             await self._database.executemany(_DELETE, deletes)
             await self._database.executemany(_PUT, puts)
             await self._database.commit()
         except sqlite3.Error as error:
             await self._roll_back()
             raise StoreError(f"cannot write the store: {error}") from error
+
+    async def _try_to_write(self) -> None:
+        await self._database.execute(_TRIAL)
+        await self._database.execute("INSERT INTO trial VALUES (zeroblob(?))", (TRIAL_BYTES,))
+        await self._database.commit()  # pages that are freed in the same transaction are not written
+        await self._database.execute("DELETE FROM trial")
 
     async def check(self) -> None:
         """Check that the file is there and can be read.

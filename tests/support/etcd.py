@@ -21,6 +21,7 @@ from support.ports import free_ports
 from support.processes import finish
 
 START_S = 120.0
+OK = 200
 
 
 class Member:
@@ -76,6 +77,16 @@ class Cluster:
     async def leader(self) -> Member:
         """Return the member that leads."""
         return await self.leader_of(self.members)
+
+    async def set_alarm(self, *, on: bool) -> None:
+        """Raise the alarm of a full database at the first member, or disarm it."""
+        url = f"http://{self.endpoints[0]}/v3/maintenance/"
+        async with aiohttp.ClientSession() as session:
+            async with session.post(f"{url}status", json={}) as reply:
+                member = (await reply.json())["header"]["member_id"]
+            alarm = {"action": "ACTIVATE" if on else "DEACTIVATE", "memberID": member, "alarm": "NOSPACE"}
+            async with session.post(f"{url}alarm", json=alarm) as reply:
+                assert reply.status == OK, await reply.text()
 
     async def leader_of(self, members: Sequence[Member]) -> Member:
         """Return the member that leads; those asked must run."""

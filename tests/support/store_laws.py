@@ -26,6 +26,9 @@ async def check_terms(store: Store) -> int:
     assert second > first
     with pytest.raises(StaleTermError, match="another master has taken over"):
         await store.save([Row("users", "a", b"3")], first)
+    with pytest.raises(StaleTermError):
+        await store.save([], first)
+    await store.save([], second)
     await store.save([Row("users", "b", b"4")], second)
     assert await store.load() == {"users": {"a": b"2", "b": b"4"}}
     third = await store.begin_term(above=second + 100)

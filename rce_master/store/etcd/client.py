@@ -330,6 +330,15 @@ class EtcdClient:
         """
         await self._call("v3/lease/revoke", wire.lease_request(lease), wire.as_it_is)
 
+    async def faults(self) -> tuple[str, ...]:
+        """Return the faults of the cluster that the member in use knows; it asks no other member.
+
+        Raises:
+            EtcdRefusedError: etcd refused.
+            EtcdAwayError: No member answered.
+        """
+        return await self._call("v3/maintenance/status", {}, wire.read_faults)
+
     # Requests
 
     async def _call(

@@ -22,12 +22,18 @@ NOT_FOUND = 5
 _INVALID, _EXHAUSTED, _DENIED, _NOT_AUTHENTICATED = 3, 8, 7, 16
 _TOO_LARGE = ("too large", "larger than max", "too many operations")
 _LARGER = "start etcd with --max-request-bytes 16777216"
+_MAKE_ROOM = (
+    "its database is full: compact and defragment it, or start etcd with a greater --quota-backend-bytes,"
+    " then run: etcdctl alarm disarm"
+)
+NO_SPACE_ALARM = "NOSPACE"
+"""Of an etcd that takes no writes and no leases until the alarm is disarmed."""
+NO_SPACE = f"etcd refuses all writes: database space exceeded; {_MAKE_ROOM}"
 _HINTS = {
     "too large": _LARGER,
     "larger than max": _LARGER,
     "too many operations": "start etcd with --max-txn-ops 4096",
-    "space exceeded": "its database is full: compact and defragment it, or start etcd with a greater"
-    " --quota-backend-bytes, then run: etcdctl alarm disarm",
+    "space exceeded": _MAKE_ROOM,
 }
 _CERTIFICATE_HINT = "etcd asks for a login or a certificate that this master does not have"
 

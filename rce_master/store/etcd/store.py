@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError, StoreError
 from rce_master.store.etcd.client import LOAD_S
-from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError, with_remedy
+from rce_master.store.etcd.exceptions import (
+    NO_SPACE,
+    NO_SPACE_ALARM,
+    OUT_OF_RANGE,
+    EtcdAwayError,
+    EtcdRefusedError,
+    with_remedy,
+)
 from rce_master.store.etcd.layout import (
     Keys,
     LeadershipView,
@@ -266,17 +273,20 @@ class EtcdStore:
         raise FencedError(f"another program writes below {self._keys.root}: the last save is {found}")
 
     async def check(self) -> None:
-        """Check that a majority of etcd's members answers.
+        """Check that a majority of etcd's members answers, and that etcd takes writes.
 
         Raises:
             StoreError: It does not.
         """
         try:
             found = await self._client.get(self._keys.schema)
+            faults = await self._client.faults()
         except EtcdAwayError as error:
             raise StoreError(with_remedy(error)) from error
         if found is None:
             raise StoreError(f"the state below {self._keys.root} was removed from etcd")
+        if any(NO_SPACE_ALARM in fault for fault in faults):
+            raise StoreError(NO_SPACE)
 
     async def close(self) -> None:
         """Nothing to let go of: the client is the caller's."""

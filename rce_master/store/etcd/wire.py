@@ -308,6 +308,18 @@ def read_fault(body: bytes) -> GatewayFault | None:
         return None
 
 
+def read_faults(answer: Message) -> tuple[str, ...]:
+    """Read what a member tells of faults of itself and of the cluster, such as ``memberID:5 alarm:NOSPACE``.
+
+    Raises:
+        WireError: It is not the status of a member.
+    """
+    faults = answer.get("errors", [])
+    if "header" not in answer or not isinstance(faults, list):
+        raise WireError("not the status of a member")
+    return tuple(map(str, faults))
+
+
 def read_version(body: bytes) -> tuple[int, int]:
     """Read the major and minor version of a server.
 

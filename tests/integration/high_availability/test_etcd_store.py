@@ -12,7 +12,7 @@ from support.etcd import Cluster, CuttingProxy
 from support.master_program import rce
 from support.store_laws import check_round_trip, check_snapshot, check_terms
 
-from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError
+from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError, StoreError
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore
 from rce_master.store.etcd.layout import Keys, prepare
@@ -202,3 +202,20 @@ async def test_the_first_user_is_added_before_a_master_leads(
     await client.revoke(lease)
     told = await rce(tmp_path, "user", *add[:-1], "etcd://", text="secret\nsecret\n", code=1)
     assert "--store must name members of etcd" in told
+
+
+async def test_check_tells_of_a_full_database(etcd: Cluster, client: EtcdClient, prefix: str) -> None:
+    """Nothing has to be written for it: reads are answered as before."""
+    await prepare(client, prefix)
+    store, term, _ = await lead(client, prefix)
+    await store.check()
+    await etcd.set_alarm(on=True)
+    try:
+        with pytest.raises(StoreError, match=r"database space exceeded.*alarm disarm"):
+            await store.check()
+        with pytest.raises(StoreError, match=r"database space exceeded.*alarm disarm"):
+            await store.save([], term)
+    finally:
+        await etcd.set_alarm(on=False)
+    await store.save([], term)
+    await store.check()

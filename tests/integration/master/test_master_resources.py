@@ -409,6 +409,24 @@ async def test_health_tells_of_a_broken_store(
         assert await health(site) == (200, "ok")
 
 
+async def test_health_is_good_again_without_a_write(run_site: RunSite) -> None:
+    """A load balancer that asks for the health sends no writes to a master that answers 503."""
+    store = BrokenStore()
+
+    async def status(site: Site) -> int:
+        async with site.session.get(f"{site.url}healthz") as reply:
+            return reply.status
+
+    async with run_site(store) as site:
+        store.broken = True
+        await site.api("POST", "/containers", {"tag": "c"}, status=503)
+        assert await status(site) == 503
+        store.broken = False
+        async with asyncio.timeout(60):
+            while await status(site) != 200:
+                await asyncio.sleep(0.05)
+
+
 async def test_a_task_set_without_a_name_is_told_so(site: Site, caplog: pytest.LogCaptureFixture) -> None:
     async with site.containers() as there:
         nameless = type(there)(site.master, TaskSetKind.CONTAINER, "")

@@ -135,3 +135,12 @@ def test_a_watch_tells_of_a_compaction() -> None:
 def test_what_is_no_answer_to_a_watch_is_refused(line: bytes) -> None:
     with pytest.raises(wire.WireError):
         wire.read_watched(line)
+
+
+def test_faults_of_a_cluster_are_those_of_its_status() -> None:
+    status = {"header": HEADER, "errors": ["memberID:5 alarm:NOSPACE "]}
+    assert wire.read_faults(status) == ("memberID:5 alarm:NOSPACE ",)
+    assert wire.read_faults({"header": HEADER}) == ()
+    for other in ({}, {"header": HEADER, "errors": 1}):
+        with pytest.raises(wire.WireError):
+            wire.read_faults(other)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import stat
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ from support.store_laws import check_round_trip, check_snapshot, check_terms
 
 from rce_master.exceptions import StoreBusyError, StoreError
 from rce_master.store import MemoryStore, Row, SqliteStore
+from rce_master.store.sqlite import TRIAL_BYTES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,6 +53,22 @@ async def test_what_was_saved_is_there_without_a_close(tmp_path: Path) -> None:
     reader = sqlite3.connect(tmp_path / "rce.sqlite")
     assert reader.execute("SELECT kind, key, body FROM record").fetchall() == [("users", "a", b"1")]
     reader.close()
+    await store.close()
+
+
+async def test_a_save_without_rows_writes_to_the_file(tmp_path: Path) -> None:
+    """Only so it proves that there is room."""
+    store = await SqliteStore.open(tmp_path)
+    await store.save([Row("users", "a", b"1")])
+    log = tmp_path / "rce.sqlite-wal"
+    before = log.stat().st_size
+    await store.save([])
+    assert log.stat().st_size > before + TRIAL_BYTES
+    with contextlib.closing(sqlite3.connect(tmp_path / "rce.sqlite")) as reader:
+        pages = reader.execute("PRAGMA page_count").fetchall()
+        await store.save([])
+        assert reader.execute("PRAGMA page_count").fetchall() == pages, "it leaves nothing behind"
+    assert await store.load() == {"users": {"a": b"1"}}
     await store.close()
 
 

@@ -35,6 +35,23 @@ async def test_nothing_changes_if_it_cannot_be_stored(cloud: Cloud) -> None:
     assert len(heard) == 1
 
 
+async def test_a_tick_finds_out_that_the_store_is_repaired(cloud: Cloud) -> None:
+    cloud.store.broken = True
+    with pytest.raises(StoreError, match="disk full"):
+        await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+    await cloud.flush()
+    with pytest.raises(StoreError, match="disk full"):
+        await cloud.state_service.check_store()
+    cloud.store.broken = False
+    await cloud.flush()
+    await cloud.flush()  # it is tried after the first one was answered
+    await cloud.state_service.check_store()
+    saves = cloud.store.saves
+    await cloud.flush()
+    await cloud.flush()
+    assert cloud.store.saves == saves
+
+
 async def test_reports_do_not_suffer_from_a_broken_store(cloud: Cloud) -> None:
     robots = cloud.robots()
     await robots.hello()
