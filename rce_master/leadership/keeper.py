@@ -44,7 +44,7 @@ class LeadershipKeeper:
     Attributes:
         core: The role, the term and the deadline.
         leader: The leading master, as far as this one knows.
-        fault: Why etcd cannot be asked; empty if it can.
+        fault: Why etcd cannot be asked, or gives no lease while no master leads; empty if neither.
         url: Where other masters reach this one while it leads.
         lease: The number of the lease by which this master leads; 0: it has none.
         is_drained: Whether this master is drained, as a stand-by saw it last.
@@ -72,6 +72,8 @@ class LeadershipKeeper:
         self.core = LeadershipCore(settings or LeaseSettings())
         self.leader: Leader | None = None
         self.fault = ""
+        self._refusal = ""
+        """Why the last request for a lease failed; a look at etcd can succeed meanwhile."""
         self.is_drained = False
         self.on_save: Callable[[int], None] | None = None
         self.on_look: Callable[[int], None] = lambda _: None
@@ -116,8 +118,10 @@ class LeadershipKeeper:
         except StoreError as error:
             self._note(with_remedy(error))
             return self.core.looked(is_led=None, is_drained=self.is_drained, now=self._clock())
-        self._note("")
         self.leader, self.is_drained = seen.leader, self._name in seen.drained
+        if self.leader is not None:
+            self._refusal = ""
+        self._note(self._refusal)
         self.on_look(self.newest_term())
         if self.on_save is not None:
             self.on_save(seen.last)
@@ -128,8 +132,11 @@ class LeadershipKeeper:
         try:
             self.lease, ttl = await self._client.grant(math.ceil(self.core.settings.ttl))
         except StoreError as error:
-            self._note(with_remedy(error))
+            self._refusal = with_remedy(error)
+            self._note(self._refusal)
             return False
+        self._refusal = ""
+        self._note("")
         self.core.granted(sent, ttl)
         candidacy = Candidacy(self.lease, self._name, self._remaining, self.url)
         store = EtcdStore(self._client, self._prefix, candidacy)

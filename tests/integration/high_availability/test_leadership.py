@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 from support.engine import until
+from support.etcd import Cluster
 
 from rce_master.exceptions import FencedError
 from rce_master.leadership import LeaseSettings, Role
@@ -92,4 +93,29 @@ async def test_a_master_whose_clock_jumped_leads_no_more(client: EtcdClient) -> 
         fence.check()
     with pytest.raises(FencedError):
         await keeper.keep()
+    await keeper.step_down()
+
+
+async def test_a_full_etcd_is_told_once_until_it_has_room(
+    etcd: Cluster, client: EtcdClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It answers each look and grants no lease; what a stand-by shows does not change from look to look."""
+    keeper = LeadershipKeeper(client, "/full", "one", PATIENT)
+    shown: list[str] = []
+
+    def looked(_: int) -> None:
+        shown.append(keeper.fault)
+        keeper.wake()
+
+    keeper.on_look = looked
+    await etcd.set_alarm(on=True)
+    waiting = asyncio.create_task(keeper.acquire())
+    try:
+        await until(lambda: len(shown) > 5, what="it has looked several times")
+        assert all("database space exceeded" in fault for fault in shown[1:])
+        assert caplog.text.count("database space exceeded") == 1
+    finally:
+        await etcd.set_alarm(on=False)
+        await waiting
+    assert keeper.fault == ""
     await keeper.step_down()
