@@ -270,16 +270,22 @@ class EtcdClient:
         endpoint = self._endpoints[used]
         watch = Watch(used)
         try:
-            async with self._session.post(
-                f"{'http' if self._tls is None else 'https'}://{endpoint}/v3/watch",
-                json=wire.watch_request(prefix, revision),
-                timeout=aiohttp.ClientTimeout(total=None, sock_connect=self._attempt),
-                ssl=True if self._tls is None else self._tls(),
-                allow_redirects=False,
-                read_bufsize=WATCH_BUFFER,
-            ) as response:
+            async with asyncio.timeout(self._attempt):  # etcd begins its answer before there is a change
+                response = await self._session.post(
+                    f"{'http' if self._tls is None else 'https'}://{endpoint}/v3/watch",
+                    json=wire.watch_request(prefix, revision),
+                    timeout=aiohttp.ClientTimeout(total=None),
+                    ssl=True if self._tls is None else self._tls(),
+                    allow_redirects=False,
+                    read_bufsize=WATCH_BUFFER,
+                )
+            async with response:
                 watch.content = response.content
                 yield watch
+        except TimeoutError:
+            watch.give_up()
+            text = f"no answer within {self._attempt:.3g} s"
+            raise EtcdAwayError([f"{endpoint}: {text}"], maybe_done=False) from None
         except (aiohttp.ClientError, OSError, wire.WireError) as error:
             watch.give_up()
             text = explain_to_client(error) or str(error) or type(error).__name__

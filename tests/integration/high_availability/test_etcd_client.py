@@ -236,6 +236,21 @@ async def test_a_call_whose_answer_has_begun_stays() -> None:
     assert page.count == 9
 
 
+@pytest.mark.needs("etcd")
+async def test_a_silent_member_holds_no_watch(etcd: Cluster) -> None:
+    """The next watch asks another member, whose answer comes before there is a change."""
+    async with (
+        silent_server() as (silent, read),
+        EtcdClient([silent, *etcd.endpoints], attempt=2.0) as client,
+    ):
+        with pytest.raises(EtcdAwayError, match="no answer within 2 s"):
+            async with asyncio.timeout(LOAD_S), client.watch("/silent/", 1):
+                pytest.fail("it does not answer")
+        async with client.watch("/silent/", 1) as watch:
+            assert client.uses(watch)
+    assert read
+
+
 async def check_runtime_faults(client: EtcdClient) -> None:
     """What a leader and a stand-by show at ``/healthz`` names what to do when etcd has no quorum."""
     with pytest.raises(StoreError, match=r"more than half of the members.*rce cluster recover"):
