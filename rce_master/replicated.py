@@ -37,7 +37,7 @@ from rce_master.packages.copies import ArchiveCopies
 from rce_master.packages.transfer import ArchiveClient
 from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS, SNAPSHOTS_PATH
 from rce_master.store.etcd import EtcdClient
-from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
+from rce_master.store.etcd.exceptions import QUORUM, EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import prepare
 from rce_master.store.lock import FolderLock
 
@@ -252,18 +252,27 @@ def _tell_each_other(keeper: LeadershipKeeper, follower: StateFollower, forwarde
 
 
 async def _prepare(client: EtcdClient, prefix: str) -> None:
-    """Prepare etcd, which may be starting at the same time as this program."""
+    """Prepare etcd, which may be starting at the same time as this program.
+
+    Raises:
+        StoreError: It cannot be used, or does not answer in time.
+    """
     clock = asyncio.get_running_loop().time
     end = clock() + START_TIMEOUT_S
     level = logging.WARNING
-    while True:
-        try:
-            await prepare(client, prefix)
-        except (EtcdAwayError, NoQuorumError) as error:
-            if clock() >= end:
-                raise
-            _log.log(level, "%s; trying again for %.0f s", error, end - clock())
-            level = logging.DEBUG
-        else:
-            return
-        await asyncio.sleep(_PAUSE_S)
+    last: EtcdAwayError | NoQuorumError = NoQuorumError(
+        f"etcd has no quorum, or needs more than {START_TIMEOUT_S:.3g} s for an answer: {QUORUM}"
+    )
+    try:
+        async with asyncio.timeout_at(end):
+            while True:
+                try:
+                    await prepare(client, prefix)
+                except (EtcdAwayError, NoQuorumError) as error:
+                    _log.log(level, "%s; trying again for %.0f s", error, end - clock())
+                    level, last = logging.DEBUG, error
+                else:
+                    return
+                await asyncio.sleep(_PAUSE_S)
+    except TimeoutError:
+        raise last from None

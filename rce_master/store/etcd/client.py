@@ -168,16 +168,19 @@ class EtcdClient:
         Raises:
             StoreError: It is not; the text says what is wrong and what to do.
         """
-        reasons = []
-        for endpoint in self._endpoints:
-            try:
-                await self._check_version(endpoint)
-            except _FailedError as error:
-                reasons.append(f"{endpoint}: {error}")
+        answers = await asyncio.gather(*map(self._check_version, self._endpoints), return_exceptions=True)
+        reasons = {}
+        for number, error in enumerate(answers):
+            if isinstance(error, _FailedError):
+                reasons[number] = f"{self._endpoints[number]}: {error}"
+            elif error is not None:
+                raise error
         if len(reasons) == len(self._endpoints):
-            raise EtcdAwayError(reasons, maybe_done=False)
-        for reason in reasons:
+            raise EtcdAwayError([*reasons.values()], maybe_done=False)
+        for reason in reasons.values():
             _log.warning("a member of etcd cannot be used: %s", reason)
+        while self._current in reasons:
+            self._current = (self._current + 1) % len(self._endpoints)
         try:
             await self.get("/")
         except EtcdAwayError as error:

@@ -7,7 +7,7 @@ import contextlib
 import json
 import signal
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from pathlib import Path
 
 import pytest
@@ -20,12 +20,13 @@ from support.ports import free_port
 
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity
+from rce_master import replicated
 from rce_master.exceptions import StoreError
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore
 from rce_master.store.etcd.client import LOAD_S
-from rce_master.store.etcd.exceptions import EtcdAwayError
+from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import Keys, prepare
 from rce_master.store.etcd.wire import Put
 
@@ -46,6 +47,13 @@ async def other_server(answers: dict[str, object]) -> AsyncIterator[str]:
             return web.Response(status=404, text="Not Found\n")
         return web.json_response(answers[request.path])
 
+    async with served(answer) as endpoint:
+        yield endpoint
+
+
+@contextlib.asynccontextmanager
+async def served(answer: Callable[[web.Request], Awaitable[web.StreamResponse]]) -> AsyncIterator[str]:
+    """Serve the answers of a function; give the address."""
     app = web.Application()
     app.router.add_route("*", "/{path:.*}", answer)
     runner = web.AppRunner(app)
@@ -234,6 +242,59 @@ async def test_a_call_whose_answer_has_begun_stays() -> None:
             may_end.set()
             page = await asyncio.wait_for(reading, PATIENT_S)
     assert page.count == 9
+
+
+async def test_all_members_are_asked_for_their_version_at_once() -> None:
+    """One that is silent costs its time once, not once for each member that is asked after it."""
+    asked: list[web.Request] = []
+    both = asyncio.Event()
+
+    async def version(request: web.Request) -> web.Response:
+        asked.append(request)
+        if len(asked) == len(endpoints):
+            both.set()
+        await both.wait()
+        release = "3.3.27" if request.host == endpoints[0] else "3.4.23"
+        return web.json_response({"etcdserver": release, "etcdcluster": release})
+
+    async with contextlib.AsyncExitStack() as stack:
+        endpoints = [await stack.enter_async_context(served(version)) for _ in range(2)]
+        stack.callback(both.set)
+        async with EtcdClient(endpoints, attempt=PATIENT_S) as client:
+            with pytest.raises(StoreError, match=r"is version 3\.3"):
+                await client.check_members()
+
+
+@pytest.mark.needs("etcd")
+async def test_a_member_without_a_version_is_not_asked_first(etcd: Cluster) -> None:
+    async with (
+        silent_server() as (silent, read),
+        EtcdClient([silent, *etcd.endpoints], attempt=2.0) as client,
+    ):
+        await client.check_members()
+        await client.get("/")
+    assert b"GET /version" in b"".join(read)
+    assert b"POST" not in b"".join(read)
+
+
+async def test_a_start_without_a_quorum_ends_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while one pass over the members takes longer than the start may."""
+    monkeypatch.setattr(replicated, "START_TIMEOUT_S", 0.5)
+
+    ended = asyncio.Event()
+
+    async def without_quorum(request: web.Request) -> web.Response:
+        if request.path != "/version":
+            await ended.wait()
+        return web.json_response({"etcdserver": "3.4.23", "etcdcluster": "3.4.0"})
+
+    async with served(without_quorum) as endpoint, EtcdClient([endpoint], attempt=600.0) as client:
+        try:
+            with pytest.raises(NoQuorumError, match=r"etcd has no quorum.*0\.5 s.*rce cluster recover"):
+                async with asyncio.timeout(60):
+                    await replicated._prepare(client, "/rce")
+        finally:
+            ended.set()
 
 
 @pytest.mark.needs("etcd")
