@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 HEALTH_PATH: Final = "/healthz"
+CHECK_S = 1.0
+"""How long a request waits for the store; the programs that ask give up after 2 s."""
 AGAIN: Final[dict[str, str]] = {hdrs.RETRY_AFTER: "1"}
 """Headers of a stand-by's answer: whether it leads may change within a second."""
 
@@ -41,10 +43,8 @@ class Health:
 
     async def handle(self, _: web.Request) -> web.Response:
         """Answer 200, or 503 with the fault."""
-        if self._look is None:
-            self._look = asyncio.create_task(self._check())
-        fault = await asyncio.shield(self._look)
-        if self._fence is not None and self._fence.is_closed:
+        fault = "" if self._is_fenced else await self._fault()
+        if self._fence is not None and self._is_fenced:
             return web.json_response(self._fenced(self._fence), status=503, headers=AGAIN)
         tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
@@ -62,6 +62,18 @@ class Health:
     @property
     def _is_drained(self) -> bool:
         return self._drains is not None and self._drains.is_drained
+
+    @property
+    def _is_fenced(self) -> bool:
+        return self._fence is not None and self._fence.is_closed
+
+    async def _fault(self) -> str:
+        """Return the fault of the store; empty if it works."""
+        look = self._look
+        if look is None:
+            look = self._look = asyncio.create_task(self._check())
+        done, _ = await asyncio.wait([look], timeout=CHECK_S)
+        return look.result() if done else f"the store has not answered within {CHECK_S:.3g} s"
 
     async def _check(self) -> str:
         try:
