@@ -103,6 +103,9 @@ class AuditLog:
         term: Of the leadership, if other masters may lead; 0: there are no others.
         max_bytes: Of one file.
         files: How many are kept.
+
+    Attributes:
+        fault: Why the last record is in no file; empty if it is in one.
     """
 
     def __init__(
@@ -125,7 +128,7 @@ class AuditLog:
         self._next_id = max(self.first_id, self._records[-1].id + 1 if self._records else 0)
         self._descriptor = -1
         self._size = 0
-        self._failed = False
+        self.fault = ""
         self._repeated: OrderedDict[_Key, tuple[float, int]] = OrderedDict()
         self._rates = Rates(per_second=PER_SECOND, burst=BURST)
 
@@ -253,11 +256,11 @@ class AuditLog:
             elif self._size + len(line) > self._max_bytes:
                 self._turn()
             self._append(line)
-            self._failed = False
+            self.fault = ""
         except OSError as error:
-            if not self._failed:
+            if not self.fault:
                 _log.error("the audit log %s cannot be written: %s", self._file, error)
-            self._failed = True
+            self.fault = f"the audit log cannot be written: {error.strerror or error}"
             self._close()
 
     def _append(self, line: bytes) -> None:

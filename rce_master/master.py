@@ -203,6 +203,7 @@ class Master:
             forwarding=ForwardingKey(self._secret),
             drains=self._drains,
             other_audits=self._audits,
+            warnings=(lambda: audit.fault, lambda: store.fault, lambda: kept.fault),
         )
         try:
             async with asyncio.TaskGroup() as group:

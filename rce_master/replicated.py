@@ -162,7 +162,15 @@ class ReplicatedMaster:
             forwarder = await waiting.enter_async_context(self._forwarder())
             _tell_each_other(keeper, follower, forwarder)
             server = HttpServer(
-                make_standby_app(keeper, follower, forwarder, for_leader, names, settings.allowed_origins),
+                make_standby_app(
+                    keeper,
+                    follower,
+                    forwarder,
+                    for_leader,
+                    names,
+                    settings.allowed_origins,
+                    (lambda: packages.fault, lambda: snapshots.fault),
+                ),
                 settings.bind,
                 settings.http_port,
                 for_clients.server if for_clients else None,

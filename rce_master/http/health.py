@@ -11,6 +11,8 @@ from rce import __version__
 from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from rce_master.leadership import Fence
     from rce_master.leadership.drains import MasterDrains
     from rce_master.state_service import StateService
@@ -30,14 +32,20 @@ class Health:
         state_service: The owner of the store.
         fence: Of this master's leadership, if there may be other masters; then the answer says that it leads.
         drains: Tells whether this master is drained, if there may be others.
+        warnings: What is added to the status while the master works; empty texts are left out.
     """
 
     def __init__(
-        self, state_service: StateService, fence: Fence | None = None, drains: MasterDrains | None = None
+        self,
+        state_service: StateService,
+        fence: Fence | None = None,
+        drains: MasterDrains | None = None,
+        warnings: Iterable[Callable[[], str]] = (),
     ) -> None:
         self._state_service = state_service
         self._fence = fence
         self._drains = drains
+        self._warnings = tuple(warnings)
         self._look: asyncio.Task[str] | None = None
         """The running check; concurrent requests wait for its result."""
 
@@ -48,7 +56,8 @@ class Health:
             return web.json_response(self._fenced(self._fence), status=503, headers=AGAIN)
         tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
-        body: dict[str, object] = {"status": fault or "ok", "task_sets": connected}
+        status = fault or with_warnings("ok", self._warnings)
+        body: dict[str, object] = {"status": status, "task_sets": connected}
         if self._fence is not None:
             term, name, drained = self._fence.term, self._fence.name, self._is_drained
             body |= describe_role("leader", term, name, ready=not fault, drained=drained)
@@ -83,6 +92,11 @@ class Health:
         finally:
             self._look = None
         return ""
+
+
+def with_warnings(status: str, warnings: Iterable[Callable[[], str]]) -> str:
+    """Return a status with what an operator has to know beside it."""
+    return "; ".join([status, *filter(None, (warning() for warning in warnings))])
 
 
 def describe_role(role: str, term: int, leader: str, *, ready: bool, drained: bool) -> dict[str, object]:

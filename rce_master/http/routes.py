@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -75,6 +75,8 @@ class Services:
     """Of this master and the others; None if there are no others."""
     other_audits: OtherAudits | None = None
     """The audit logs of the others; None if there are none."""
+    warnings: Sequence[Callable[[], str]] = ()
+    """What an operator has to know while the master works; each is empty if it is well."""
 
 
 @dataclass(frozen=True, slots=True)

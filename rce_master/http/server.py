@@ -61,7 +61,8 @@ def make_app(
     inner = [] if fence is None else [_fencing(fence), settling(services.state_service, fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
-    app.router.add_get(HEALTH_PATH, Health(services.state_service, services.fence, services.drains).handle)
+    health = Health(services.state_service, services.fence, services.drains, services.warnings)
+    app.router.add_get(HEALTH_PATH, health.handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app

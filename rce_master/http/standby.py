@@ -9,12 +9,12 @@ from aiohttp import web
 
 from rce.web.origin import ServerNames
 from rce_master.http.forward import NotForwardedError
-from rce_master.http.health import AGAIN, HEALTH_PATH, describe_role
+from rce_master.http.health import AGAIN, HEALTH_PATH, describe_role, with_warnings
 from rce_master.http.origin_guard import origin_guard
 from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
     from typing import Protocol
 
     from rce_master.follower import StateFollower
@@ -35,6 +35,7 @@ def make_standby_app(
     for_leader: Iterable[Routes],
     names: ServerNames | None = None,
     allowed_origins: Iterable[str] = (),
+    warnings: Iterable[Callable[[], str]] = (),
 ) -> web.Application:
     """Make the application of a stand-by.
 
@@ -45,8 +46,9 @@ def make_standby_app(
         for_leader: What the leading master asks for.
         names: The allowed host names of the server.
         allowed_origins: Origins of other sites whose pages may use the server.
+        warnings: What is added to the status; empty texts are left out.
     """
-    standby = _Standby(keeper, follower, forwarder)
+    standby = _Standby(keeper, follower, forwarder, tuple(warnings))
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
     app.router.add_get(HEALTH_PATH, standby.health)
     app.router.add_get("/metrics", standby.metrics)
@@ -59,7 +61,14 @@ def make_standby_app(
 class _Standby:
     """Answers the requests."""
 
-    def __init__(self, keeper: LeadershipKeeper, follower: StateFollower, forwarder: Forwarder) -> None:
+    def __init__(
+        self,
+        keeper: LeadershipKeeper,
+        follower: StateFollower,
+        forwarder: Forwarder,
+        warnings: Sequence[Callable[[], str]],
+    ) -> None:
+        self._warnings = warnings
         self._keeper = keeper
         self._follower = follower
         self._forwarder = forwarder
@@ -68,8 +77,9 @@ class _Standby:
         """Tell the role."""
         keeper = self._keeper
         name = "" if keeper.leader is None else keeper.leader.name
+        status = keeper.fault or f"stand-by; {f'{name} leads' if name else 'no master leads now'}"
         body = {
-            "status": keeper.fault or f"stand-by; {f'{name} leads' if name else 'no master leads now'}",
+            "status": with_warnings(status, self._warnings),
             **describe_role("standby", self._term, name, ready=False, drained=keeper.is_drained),
             "lag": round(self._follower.seconds_behind, 3),
             "lag_revisions": self._follower.lag.revisions,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -32,6 +33,7 @@ ARCHIVES_PATH = "/archives"
 _HASH = re.compile(r"[0-9a-f]{64}")
 _INCOMING = "incoming"
 _BUFFER = 1 << 20
+_FULL = frozenset((errno.ENOSPC, errno.EDQUOT))
 
 
 class Incoming:
@@ -69,6 +71,9 @@ class ContentStore:
         folder: Made with the first archive.
         limits: How large each may be.
         noun: What they are part of, for errors.
+
+    Attributes:
+        fault: Why the last archive was not kept, if the disk was full; empty if it was kept.
     """
 
     def __init__(
@@ -78,6 +83,7 @@ class ContentStore:
         self._folder = folder
         self._limits = limits
         self._numbers = count(1)
+        self.fault = ""
 
     @contextlib.asynccontextmanager
     async def receive(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[Incoming]:
@@ -94,7 +100,7 @@ class ContentStore:
             finally:
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"the master cannot keep the {self._noun}: {error.strerror or error}") from error
+            raise self._refused(error) from error
 
     async def keep(self, incoming: Incoming) -> None:
         """Keep an archive; when this returns, it survives a crash.
@@ -105,7 +111,8 @@ class ContentStore:
         try:
             await asyncio.to_thread(self._keep, incoming)
         except OSError as error:
-            raise StoreError(f"the master cannot keep the {self._noun}: {error.strerror or error}") from error
+            raise self._refused(error) from error
+        self.fault = ""
 
     async def read(self, sha256: str, offset: int, length: int) -> tuple[bytes, int] | None:
         """Read a piece of an archive.
@@ -162,6 +169,12 @@ class ContentStore:
     def forget_incoming(self) -> None:
         """Remove unfinished uploads of an earlier master. Blocks."""
         shutil.rmtree(self._folder / _INCOMING, ignore_errors=True)
+
+    def _refused(self, error: OSError) -> StoreError:
+        text = f"the master cannot keep the {self._noun}: {error.strerror or error}"
+        if error.errno in _FULL:
+            self.fault = text
+        return StoreError(text)
 
     def _make_incoming(self) -> Path:
         incoming = self._folder / _INCOMING

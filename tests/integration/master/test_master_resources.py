@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 import json
+import os
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ from support.engine import until
 from rce.control.messages import Drop, Gone, MachineInfo, Put, TaskSetKind, Usage
 from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, NodeState, NodeStatus, NodeUsage
 from rce.model.specs import RestartPolicy
+from rce_master.audit import AuditLog
 from rce_master.auth import client_digest
 from rce_master.cli import machines, top
 from rce_master.cli.client import ApiClient
@@ -425,6 +428,17 @@ async def test_health_is_good_again_without_a_write(run_site: RunSite) -> None:
         async with asyncio.timeout(60):
             while await status(site) != 200:
                 await asyncio.sleep(0.05)
+
+
+async def test_health_tells_of_a_full_disk(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(AuditLog, "_append", full)
+    await site.api("POST", "/containers", {"tag": "c"}, status=204)
+    async with site.session.get(f"{site.url}healthz") as reply:
+        said = (await reply.json())["status"]
+    assert (reply.status, said) == (200, "ok; the audit log cannot be written: No space left on device")
 
 
 async def test_a_task_set_without_a_name_is_told_so(site: Site, caplog: pytest.LogCaptureFixture) -> None:

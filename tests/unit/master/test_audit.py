@@ -60,7 +60,9 @@ def test_disk_that_gets_full_within_a_record_costs_no_later_one(
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "No space left on device" in caplog.text
+    assert log.fault == "the audit log cannot be written: No space left on device"
     log.add("carol", "log_in")
+    assert log.fault == ""
     log.close()
     first, half, last = file.read_bytes().splitlines()
     assert len(half) == 10

@@ -61,3 +61,13 @@ async def test_a_fenced_master_asks_no_store() -> None:
     fence = Fence(core, lambda: 103.0, "one:9000")
     status, body = await ask(Health(await StateService.open(store), fence))
     assert (status, body["role"], store.checks) == (503, "standby", 0)
+
+
+async def test_warnings_stand_beside_a_status_that_is_good() -> None:
+    texts = ["", "the disk is full", "join a third"]
+    warnings = [lambda number=number: texts[number] for number in range(3)]
+    served = Health(await StateService.open(FragileStore()), warnings=warnings)
+    status, body = await ask(served)
+    assert (status, body["status"]) == (200, "ok; the disk is full; join a third")
+    texts[:] = ["", "", ""]
+    assert (await ask(served))[1]["status"] == "ok"
