@@ -43,7 +43,7 @@ from rce_master.state_service import StateService
 from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterable
 
     from aiohttp import web
     from argon2 import PasswordHasher
@@ -106,6 +106,7 @@ class Master:
         drains: Of this master and the others, if there may be any; the caller runs them.
         audits: Those of the others, if there may be any.
         copy: As :meth:`rce_master.state_service.StateService.open` takes it.
+        warnings: What ``/healthz`` tells beside what this master finds; empty texts are left out.
     """
 
     def __init__(
@@ -120,12 +121,14 @@ class Master:
         drains: MasterDrains | None = None,
         audits: OtherAudits | None = None,
         copy: Callable[[], Awaitable[State | None]] | None = None,
+        warnings: Iterable[Callable[[], str]] = (),
     ) -> None:
         self._fence = fence
         self._copies = copies
         self._drains = drains
         self._audits = audits
         self._copy = copy
+        self._warnings = tuple(warnings)
         self._settings = settings
         self._secret = secret
         self._store = store
@@ -203,7 +206,7 @@ class Master:
             forwarding=ForwardingKey(self._secret),
             drains=self._drains,
             other_audits=self._audits,
-            warnings=(lambda: audit.fault, lambda: store.fault, lambda: kept.fault),
+            warnings=(lambda: audit.fault, lambda: store.fault, lambda: kept.fault, *self._warnings),
         )
         try:
             async with asyncio.TaskGroup() as group:

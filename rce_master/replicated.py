@@ -19,6 +19,8 @@ from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.audit import AUDIT
+from rce_master.cluster.client import ClusterClient
+from rce_master.cluster.member_advice import MemberAdvice
 from rce_master.exceptions import FencedError, MasterError
 from rce_master.follower import StateFollower
 from rce_master.http.forwarded import ForwardingKey
@@ -111,7 +113,7 @@ class ReplicatedMaster:
         try:
             tls = None if identity is None else identity.client
             attempt = settings.lease / _ATTEMPTS
-            async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
+            async with ClusterClient(address.endpoints, tls=tls, attempt=attempt) as client:
                 registry = MasterRegistry(client, address.prefix, settings.name)
                 async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as patient:
                     await _prepare(patient, address.prefix)
@@ -120,12 +122,14 @@ class ReplicatedMaster:
                         await registry.check_name(patient, Probe(session, self._masters_tls()).answers)
                 lease = LeaseSettings(ttl=settings.lease)
                 keeper = LeadershipKeeper(client, address.prefix, settings.name, lease)
+                advice = MemberAdvice(client)
                 async with TaskScope() as tasks:
                     tasks.spawn(registry.run(), name="registry of masters")
+                    tasks.spawn(advice.run(), name="members of etcd")
                     if identity is not None:
                         tasks.spawn(watch_expiry([identity.files]), name="certificate for etcd")
                     while not is_stopping():
-                        await self._stand_by_and_lead(client, keeper, registry, on_ready, on_standby)
+                        await self._stand_by_and_lead(client, keeper, registry, advice, on_ready, on_standby)
         finally:
             lock.close()
 
@@ -134,6 +138,7 @@ class ReplicatedMaster:
         etcd: EtcdClient,
         keeper: LeadershipKeeper,
         registry: MasterRegistry,
+        advice: MemberAdvice,
         on_ready: Callable[[RunningMaster], None],
         on_standby: Callable[[str], None],
     ) -> None:
@@ -206,6 +211,7 @@ class ReplicatedMaster:
                     drains=drains,
                     audits=OtherAudits(registry, standbys),
                     copy=partial(follower.take, store.begun),
+                    warnings=[lambda: advice.text],
                 )
                 async with asyncio.TaskGroup() as group:
                     works = (keeper.keep(), drains.run(), mark.run())
