@@ -18,6 +18,14 @@ Snapshot = Mapping[str, Mapping[str, bytes]]
 """The contents of a store: table name to key to encoded record."""
 
 
+def other_version(store: str, version: object) -> str:
+    """Return that another release wrote a store, and what to do."""
+    return (
+        f"{store} has version {version}, this program reads version {SCHEMA_VERSION}: install the release"
+        " that wrote it, or restore a backup made before the upgrade (docs/how-to/backup.md)"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A record as a store keeps it."""

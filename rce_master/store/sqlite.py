@@ -10,7 +10,7 @@ import aiosqlite
 
 from rce.config import STORE_FILE
 from rce_master.exceptions import StaleTermError, StoreError
-from rce_master.store.base import SCHEMA_VERSION
+from rce_master.store.base import SCHEMA_VERSION, other_version
 from rce_master.store.lock import FolderLock
 
 if TYPE_CHECKING:
@@ -201,8 +201,6 @@ async def _prepare(database: aiosqlite.Connection, path: Path) -> None:
         await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         await database.commit()
     elif version != SCHEMA_VERSION:
-        raise StoreError(
-            f"the store {path} has version {version}, this program reads version {SCHEMA_VERSION}"
-        )
+        raise StoreError(other_version(f"the store {path}", version))
     await database.execute(_LEASE)
     await database.commit()

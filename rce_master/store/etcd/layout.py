@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import StoreError
-from rce_master.store.base import SCHEMA_VERSION
+from rce_master.store.base import SCHEMA_VERSION, other_version
 from rce_master.store.etcd.wire import Condition, Put, Record, Subject
 
 if TYPE_CHECKING:
@@ -131,10 +131,7 @@ async def check_state(client: EtcdClient, prefix: str) -> None:
 def _check_version(keys: Keys, schema: Record) -> None:
     if schema.value != str(SCHEMA_VERSION).encode():
         version = schema.value.decode(errors="replace")
-        raise StoreError(
-            f"the store in etcd below {keys.root} has version {version}, this program reads version"
-            f" {SCHEMA_VERSION}"
-        )
+        raise StoreError(other_version(f"the store in etcd below {keys.root}", version))
 
 
 def write_number(term: int, number: int) -> bytes:

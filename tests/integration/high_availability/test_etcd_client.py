@@ -114,7 +114,9 @@ async def test_a_prefix_of_another_program_or_release_is_left_alone(tmp_path: Pa
         await client.transact([], [Put("/other/key", b"1"), Put(Keys("/newer").schema, b"99")])
         text = await refusal(etcd.endpoints[0], "/other")
         assert "keys of another program below /other/, such as '/other/key'" in text
-        assert "has version 99, this program reads version 2" in await refusal(etcd.endpoints[0], "/newer")
+        text = await refusal(etcd.endpoints[0], "/newer")
+        assert "has version 99, this program reads version 2: install the release that wrote it" in text
+        assert "restore a backup" in text
         await prepare(client, "/rce")
         await prepare(client, "/rce")
         keys = [record.key for record in (await client.range("/")).records]

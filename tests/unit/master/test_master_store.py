@@ -92,7 +92,7 @@ async def test_a_store_of_a_newer_program_is_refused(tmp_path: Path) -> None:
     database.execute("PRAGMA user_version = 99")
     database.commit()
     database.close()
-    with pytest.raises(StoreError, match="has version 99"):
+    with pytest.raises(StoreError, match=r"has version 99, .*install the release .*restore a backup"):
         await SqliteStore.open(tmp_path)
 
 
