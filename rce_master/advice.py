@@ -9,6 +9,8 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
+from msgspec.structs import replace
+
 from rce.model import MEGABYTE, MIN_MEMORY, Resources, write_cores, write_memory
 from rce_master.usage import STEP_S, WINDOW_S, History, rates_between
 
@@ -39,20 +41,32 @@ class Advice(NamedTuple):
     command: str
 
 
+class Subject(NamedTuple):
+    """The container that advice is about."""
+
+    tag: str
+    requested: Resources
+    user: str = ""
+    """Whose it is, for the commands; empty: the reader's, who need not name that."""
+
+    def command(self, verb: str, arguments: str) -> str:
+        """Return a command about it."""
+        whose = f" --user {self.user}" if self.user else ""
+        return f"rce {verb} {self.tag} {arguments}{whose}"
+
+
 def for_container(
-    tag: str, requested: Resources, history: History, room: Room | None, others: Sequence[Room] = ()
+    subject: Subject, history: History, room: Room | None, others: Sequence[Room] = ()
 ) -> list[Advice]:
     """Return advice on whether a container should be resized or moved.
 
     Args:
-        tag: The container's.
-        requested: Its request.
+        subject: The container.
         history: Its usage.
         room: Its machine, to find out whether it has room to grow; None if unknown.
-        others: Machines that it could move to.
+        others: Machines that it could move to, the emptiest first; its own may be among them.
     """
-    rooms = _Rooms(room, others)
-    return [*_too_small(tag, requested, history, rooms), *_too_large(tag, requested, history)]
+    return [*_too_small(subject, history, _Rooms(room, others)), *_too_large(subject, history)]
 
 
 class _Rooms(NamedTuple):
@@ -62,7 +76,7 @@ class _Rooms(NamedTuple):
     others: Sequence[Room]
 
 
-def _too_small(tag: str, requested: Resources, history: History, rooms: _Rooms) -> Iterator[Advice]:
+def _too_small(subject: Subject, history: History, rooms: _Rooms) -> Iterator[Advice]:
     now, samples = history.now.usage, history.samples
     oldest = samples[0]
     watched = history.now.time - oldest.time
@@ -70,45 +84,38 @@ def _too_small(tag: str, requested: Resources, history: History, rooms: _Rooms) 
     if kills > 0 and now.memory_limit:
         times = "once" if kills == 1 else f"{kills} times"
         text = f"its memory ran out {times} lately (limit {_mb(now.memory_limit)})"
-        yield _more_memory(tag, text, requested, rooms, 2 * now.memory_limit)
+        yield _more_memory(subject, text, rooms, 2 * now.memory_limit)
     elif now.memory_limit and now.memory > NEARLY_FULL * now.memory_limit:
         text = f"uses {_mb(now.memory)} of its {_mb(now.memory_limit)} of memory"
-        yield _more_memory(tag, text, requested, rooms, 1.5 * now.memory_limit)
+        yield _more_memory(subject, text, rooms, 1.5 * now.memory_limit)
     throttled = rates_between(oldest, history.now).throttled
     if now.cpu_limit and watched >= _SOON_S and throttled > THROTTLED:
         better = _steps(now.cpu_limit * (1 + throttled), _CORES_STEP)
         limit = write_cores(now.cpu_limit)
         text = f"was held back by its limit of {limit} cores for {throttled:.0%} of the time"
         change = f"--cpu {write_cores(better)}"
-        yield _grow(
-            tag,
-            text,
-            change,
-            requested,
-            Resources(size=requested.size, cpu=better, memory=requested.memory),
-            rooms,
-        )
+        yield _grow(subject, text, change, replace(subject.requested, cpu=better), rooms)
 
 
-def _more_memory(tag: str, text: str, requested: Resources, rooms: _Rooms, better: float) -> Advice:
+def _more_memory(subject: Subject, text: str, rooms: _Rooms, better: float) -> Advice:
     memory = int(_steps(better, _MEMORY_STEP))
-    grown = Resources(size=requested.size, cpu=requested.cpu, memory=memory)
-    return _grow(tag, text, f"--memory {write_memory(memory)}", requested, grown, rooms)
+    grown = replace(subject.requested, memory=memory)
+    return _grow(subject, text, f"--memory {write_memory(memory)}", grown, rooms)
 
 
-def _grow(tag: str, text: str, change: str, requested: Resources, grown: Resources, rooms: _Rooms) -> Advice:
-    room, command = rooms.own, f"rce resize {tag} {change}"
+def _grow(subject: Subject, text: str, change: str, grown: Resources, rooms: _Rooms) -> Advice:
+    room, requested, command = rooms.own, subject.requested, subject.command("resize", change)
     if room is not None and (lacks := room.without(requested).shortages(grown, requested)):
         text += f"; its machine has no room for more ({room.name} {' and '.join(lacks)})"
         elsewhere = next((one for one in rooms.others if one is not room and one.fits(grown)), None)
         if elsewhere is not None:
             text += f", {elsewhere.name} has; an administrator can move it there first"
-            command = f"rce move {tag} {elsewhere.name} --wait && {command}"
+            command = f"{subject.command('move', f'{elsewhere.name} --wait')} && {command}"
     return Advice("too small", text, command)
 
 
-def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Advice]:
-    now, samples = history.now.usage, history.samples
+def _too_large(subject: Subject, history: History) -> Iterator[Advice]:
+    requested, now, samples = subject.requested, history.now.usage, history.samples
     watched = history.now.time - samples[0].time
     if watched < OBSERVED_S:
         return
@@ -119,18 +126,18 @@ def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Adv
         better = max(_CORES_STEP, _steps(2 * cores, _CORES_STEP))
         if better < requested.cpu:
             text = f"used at most {write_cores(cores)} of its {write_cores(requested.cpu)} cores {lately}"
-            yield Advice("too large", text, f"rce resize {tag} --cpu {write_cores(better)}")
+            yield Advice("too large", text, subject.command("resize", f"--cpu {write_cores(better)}"))
     if requested.memory and memory < HARDLY_USED * requested.memory:
         needed = max(MIN_MEMORY, int(_steps(2 * memory, _MEMORY_STEP)))
         if needed < requested.memory:
             text = f"used at most {_mb(memory)} of its {_mb(requested.memory)} of memory {lately}"
-            yield Advice("too large", text, f"rce resize {tag} --memory {write_memory(needed)}")
+            yield Advice("too large", text, subject.command("resize", f"--memory {write_memory(needed)}"))
     if requested.size > 1 and not requested.cpu and not requested.memory and now.memory_limit:
         slots = now.memory_limit / requested.size
         if memory < HARDLY_USED * now.memory_limit and cores < HARDLY_USED * requested.size:
             better_size = max(1, math.ceil(2 * memory / slots))
             text = f"takes {requested.size} slots and used at most {_mb(memory)} of memory {lately}"
-            yield Advice("too large", text, f"rce resize {tag} --size {better_size}")
+            yield Advice("too large", text, subject.command("resize", f"--size {better_size}"))
 
 
 class Movable(NamedTuple):
@@ -146,18 +153,17 @@ def for_machine(room: Room, others: Sequence[Room], containers: Iterable[Movable
 
     Args:
         room: The machine.
-        others: The other machines.
+        others: Machines that containers could move to, the emptiest first; it may be among them.
         containers: Containers of the machine that may be moved.
     """
     if not is_too_full(room):
         return []
     full = {name: share for name, share in room.shares.items() if share > NEARLY_FULL}
     text = " and ".join(f"{share:.0%} of its {name}" for name, share in full.items()) + " are promised"
-    open_ = [other for other in others if not other.draining]
-    move = min(_moves(room, open_, containers), default=None)
+    move = min(_moves(room, others, containers), default=None)
     if move is not None:
         return [move.advice(text)]
-    relief = min(open_, key=lambda r: r.load, default=None)
+    relief = next((other for other in others if other is not room and not other.draining), None)
     if relief is None or relief.load > NEARLY_FULL:
         return [Advice("too full", f"{text}, and no machine is emptier: add one", "rce-container MASTER_IP")]
     text += f"; new containers go to {relief.name}, and smaller ones make room here"
@@ -191,7 +197,7 @@ class _Move(NamedTuple):
 
 
 def _moves(room: Room, others: Sequence[Room], containers: Iterable[Movable]) -> Iterator[_Move]:
-    """Give the moves after which the other machine is not too full."""
+    """Give each container's move to the emptiest machine that takes it and is not too full then."""
     before = _fullest(room)
     for user, tag, requested in containers:
         left = _fullest(room.without(requested))
@@ -199,8 +205,13 @@ def _moves(room: Room, others: Sequence[Room], containers: Iterable[Movable]) ->
         if moved <= 0:  # it takes nothing of what the machine is short of
             continue
         for other in others:
-            if other.fits(requested) and (load := other.load_with(requested)) <= NEARLY_FULL:
+            if other.load > NEARLY_FULL:  # so are those behind it
+                break
+            if other is room or not other.fits(requested):
+                continue
+            if (load := other.load_with(requested)) <= NEARLY_FULL:
                 yield _Move(left if left > NEARLY_FULL else 0.0, moved, load, user, tag, other.name)
+                break
 
 
 def _fullest(room: Room) -> float:

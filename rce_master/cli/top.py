@@ -50,12 +50,10 @@ def top(
 class Look:
     """The layout, and the previous observations."""
 
-    def __init__(self, sort: Order, *, nodes: bool = False, interfaces: bool = False, user: str = "") -> None:
+    def __init__(self, sort: Order, *, nodes: bool = False, interfaces: bool = False) -> None:
         self.sort = sort
         self.nodes = nodes
         self.interfaces = interfaces
-        self.user = user
-        """The user of this program; commands for containers of others name their user."""
         self._before: list[Usage] = []
 
     async def take(self, client: ApiClient, interval: float) -> RenderableType:
@@ -76,9 +74,7 @@ class Look:
 
 
 async def _top(interval: float, look: Look, *, once: bool) -> None:
-    login = credentials.load()
-    look.user = login.user
-    async with ApiClient.of(login) as client:
+    async with ApiClient.of(credentials.load()) as client:
         if once:
             console().print(await look.take(client, interval))
             return
@@ -96,7 +92,7 @@ def layout(usage: Usage, look: Look) -> Group:
     if masters := usage.get("masters"):
         parts += [overview_of_masters(masters), ""]
     parts.append(_containers(usage["containers"], look))
-    advice = [*_advice(usage["machines"], "process"), *_container_advice(usage["containers"], look.user)]
+    advice = [*_advice(usage["machines"], "process"), *_advice(usage["containers"], "id")]
     if advice:
         parts += ["", *advice]
     return Group(*parts)
@@ -181,20 +177,12 @@ def _rank(container: Usage, order: Order) -> tuple[float, str]:
     return -amounts[order], container["id"]
 
 
-def _container_advice(containers: list[Usage], user: str) -> list[Text]:
-    lines = list[Text]()
-    for container in containers:
-        of = "" if container["user"] == user or not user else f" --user {container['user']}"
-        lines += _advice([container], "id", of)
-    return lines
-
-
-def _advice(items: list[Usage], key: str, more: str = "") -> list[Text]:
+def _advice(items: list[Usage], key: str) -> list[Text]:
     lines = list[Text]()
     for item in items:
         for one in item["advice"]:
             lines.append(Text.assemble(plain(item[key], "yellow"), plain(f" {one['about']}: {one['text']}")))
-            lines.append(plain(f"  {one['command']}{more}", "bold"))
+            lines.append(plain(f"  {one['command']}", "bold"))
     return lines
 
 

@@ -104,4 +104,4 @@ async def _others(call: Call, views: UsageViews, *, is_first: bool) -> dict[str,
 
 def _views(call: Call) -> UsageViews:
     services = call.services
-    return UsageViews(services.state_service.tables, services.reconciler.book)
+    return UsageViews(services.state_service.tables, services.reconciler.book, call.caller.name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from functools import cached_property
-from heapq import nsmallest
 from typing import TYPE_CHECKING
 
 from rce.control import EndpointUsage, NodeStatus, NodeUsage
@@ -36,11 +35,13 @@ class UsageViews:
     Args:
         tables: The state's tables.
         book: The reports of the task sets.
+        reader: The user who reads it; commands about containers of others name their user.
     """
 
-    def __init__(self, tables: Tables, book: UsageBook) -> None:
+    def __init__(self, tables: Tables, book: UsageBook, reader: str = "") -> None:
         self._tables = tables
         self._book = book
+        self._reader = reader
         self._rooms = {room.process: room for room in tables.rooms}
 
     def container(self, container: Container) -> models.ContainerUsageOut:
@@ -82,14 +83,16 @@ class UsageViews:
     def _advice(self, container: Container, history: History | None, room: Room | None) -> list[Advice]:
         if history is None:
             return []
-        return advice.for_container(container.tag, container.resources, history, room, self._emptiest)
+        user = "" if container.user == self._reader else container.user
+        subject = advice.Subject(container.tag, container.resources, user)
+        return advice.for_container(subject, history, room, self._open)
 
     @cached_property
-    def _emptiest(self) -> list[Room]:
-        """The emptiest machine, and the one that takes its place in advice about the emptiest one itself."""
+    def _open(self) -> list[Room]:
+        """The machines that take containers, the emptiest first."""
         there = self._tables.is_connected
-        open_ = (room for room in self._rooms.values() if not room.draining and there(room.process))
-        return nsmallest(2, open_, key=lambda room: room.load)
+        open_ = [room for room in self._rooms.values() if not room.draining and there(room.process)]
+        return sorted(open_, key=lambda room: room.load)
 
     def _nodes(self, container: Container, history: History | None) -> list[models.NodeUsageOut]:
         status = self._tables.container_live(container.id).status
@@ -98,12 +101,9 @@ class UsageViews:
 
     async def machines(self) -> list[models.MachineUsageOut]:
         """Show all container machines; other tasks run meanwhile."""
-        return [
-            await self._machine(room, [other for other in self._emptiest if other is not room])
-            for room in self._rooms.values()
-        ]
+        return [await self._machine(room) for room in self._rooms.values()]
 
-    async def _machine(self, room: Room, others: list[Room]) -> models.MachineUsageOut:
+    async def _machine(self, room: Room) -> models.MachineUsageOut:
         cpu, memory = 0.0, 0
         movable: list[advice.Movable] = []
         is_full = advice.is_too_full(room)
@@ -131,7 +131,7 @@ class UsageViews:
             memory=room.machine.memory,
             promised_memory=room.memory,
             memory_used=memory,
-            advice=_shown(advice.for_machine(room, others, movable)),
+            advice=_shown(advice.for_machine(room, self._open, movable)),
         )
 
     def _movable(self, id_: str) -> advice.Movable | None:

@@ -12,7 +12,7 @@ from support.parts import ResourceParts
 from rce.control.messages import MachineInfo, Usage
 from rce.control.model import EndpointUsage, NodeUsage
 from rce.model.specs import Resources
-from rce_master.advice import Advice, Movable, for_container, for_machine
+from rce_master.advice import Advice, Movable, Subject, for_container, for_machine
 from rce_master.state.placement import Room
 from rce_master.usage import STEP_S, WINDOW_S, History, UsageBook
 
@@ -66,7 +66,7 @@ def texts(found: list[Advice]) -> list[tuple[str, str]]:
 
 
 def advise(history: History, room: Room | None = None, **requested: Unpack[ResourceParts]) -> list[Advice]:
-    return for_container("c", Resources(**requested), history, room)
+    return for_container(Subject("c", Resources(**requested)), history, room)
 
 
 def test_rates_are_those_of_the_last_two_reports(watched: Watched) -> None:
@@ -148,9 +148,25 @@ def test_advice_to_grow_says_when_the_machine_has_no_room(watched: Watched) -> N
     assert "its machine has no room for more (m1 has 100 of 300 MB memory free, 160 MB needed)" in advice.text
     full = Room(process="c2", machine=machine, memory=200 * MB)
     empty = Room(process="c3", machine=MachineInfo(name="m3", memory=300 * MB))
-    (advice,) = for_container("c", Resources(memory=100 * MB), history, room, [full, room, empty])
+    subject = Subject("c", Resources(memory=100 * MB))
+    (advice,) = for_container(subject, history, room, [full, room, empty])
     assert "m3 has; an administrator can move it there first" in advice.text
     assert advice.command == "rce move c m3 --wait && rce resize c --memory 160M"
+    (advice,) = for_container(subject._replace(user="bob"), history, room, [empty])
+    assert advice.command == "rce move c m3 --wait --user bob && rce resize c --memory 160M --user bob"
+
+
+def test_advice_to_move_names_a_machine_with_the_labels(watched: Watched) -> None:
+    machine = MachineInfo(name="m1", memory=300 * MB, labels=("gpu",))
+    room = Room(process="c1", machine=machine, memory=300 * MB)
+    history = watched.run(10, memory=95 * MB, memory_limit=100 * MB)
+    others = [
+        Room(process=f"c{n}", machine=MachineInfo(name=f"m{n}", memory=300 * MB, labels=labels))
+        for n, labels in ((2, ()), (3, ()), (4, ("gpu",)))
+    ]
+    subject = Subject("c", Resources(memory=100 * MB, special_features=("gpu",)))
+    (advice,) = for_container(subject, history, room, others)
+    assert advice.command == "rce move c m4 --wait && rce resize c --memory 160M"
 
 
 def test_what_is_hardly_used_is_too_large_but_not_at_once(watched: Watched) -> None:
@@ -245,7 +261,7 @@ def test_advice_is_about_one_direction_of_each_thing(
             oom_kills=kills,
             cpu_limit=requested.cpu,
         )
-    found = for_container("c", requested, history, None)
+    found = for_container(Subject("c", requested), history, None)
     assert all(one.command.startswith("rce resize c --") and one.text for one in found)
     assert len({one.command.split()[3] for one in found if one.about == "too small"}) == sum(
         one.about == "too small" for one in found

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import io
 from typing import TYPE_CHECKING, Any, cast
 
+from rich.console import Console
 from support.master_world import World
 
 from rce.control.messages import MachineInfo, Usage
 from rce.control.model import EndpointUsage
 from rce.model.specs import Network
+from rce_master.cli import top
 from rce_master.http.usage_views import UsageViews
 from rce_master.state import commands
 from rce_master.state.placement import Room
@@ -71,3 +74,44 @@ async def test_a_machine_that_is_too_full_names_a_container_to_move() -> None:
     first, second = await views.machines()
     assert [advice.command for advice in first.advice] == ["rce move b m2 --user anna"]
     assert second.advice == []
+
+
+def crowded() -> tuple[World, UsageBook]:
+    """Return a full machine with a container short of memory; the fullest of three others has its label."""
+    world = World()
+    world.container_set("c1", name="m1", memory=300 * MB, labels=("gpu",))
+    world.container("c", memory=290 * MB, special_features=("gpu",))
+    world.run("c")
+    for number in (2, 3):
+        world.container_set(f"c{number}", name=f"m{number}", memory=1000 * MB)
+    world.container_set("c4", name="m4", memory=2000 * MB, labels=("gpu",))
+    world.container("d", memory=600 * MB, special_features=("gpu",))
+    used = EndpointUsage(memory=280 * MB, memory_limit=290 * MB)
+    book = UsageBook(lambda: 1.0)
+    book.note("c1", Usage(cpu_s=0.0, memory=0, endpoints={"anna/c": used}), ["anna/c"])
+    return world, book
+
+
+async def test_advice_on_containers_of_others_names_their_user() -> None:
+    """Both a move and what follows it do; machines that are emptier but lack the label are passed over."""
+    world, book = crowded()
+    tables = world.state.tables
+    container = tables.container("anna/c")
+    assert container is not None
+
+    async def shown(reader: str) -> str:
+        views = UsageViews(tables, book, reader)
+        usage = {
+            "containers": [views.container(container).model_dump()],
+            "machines": [one.model_dump() for one in await views.machines()],
+        }
+        console = Console(file=io.StringIO(), width=250)
+        console.print(top.layout(usage, top.Look(top.Order.CPU)))
+        assert isinstance(console.file, io.StringIO)
+        return console.file.getvalue()
+
+    resize = "resize c --memory 448M"
+    assert f"rce move c m4 --wait --user anna && rce {resize} --user anna" in await shown("root")
+    own = await shown("anna")
+    assert f"rce move c m4 --wait && rce {resize}\n" in own
+    assert "rce move c m4 --user anna" in own, "advice on the machine, which is too full"
