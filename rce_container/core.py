@@ -136,8 +136,8 @@ class ManagerCore:
                 self._put(spec)
             case Patch(patch=patch):
                 self._patch(patch)
-            case Drop(id=id_, revision=revision, reason=reason):
-                self._drop(id_, revision, reason)
+            case Drop(id=id_, revision=revision, reason=reason, elsewhere=elsewhere):
+                self._drop(id_, revision, reason, elsewhere=elsewhere)
             case Sync(specs=specs):
                 self._sync(specs)
             case StatusWanted(id=id_):
@@ -174,14 +174,14 @@ class ManagerCore:
             if container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
                 self._out.append(ApplyPatch(patch.id, container.incarnation_id, patch))
 
-    def _drop(self, id_: str, revision: int, reason: str) -> None:
+    def _drop(self, id_: str, revision: int, reason: str, *, elsewhere: bool = False) -> None:
         container = self.containers.get(id_)
         if container is None:
             self._out.append(Tell(Gone(id=id_, revision=revision)))
             return
         container.desired = None
         container.drop_revision = revision
-        self._release(container, reason)
+        self._release(container, reason, saves_states=elsewhere)
 
     def _sync(self, specs: Iterable[EndpointSpec]) -> None:
         desired = {spec.id: spec for spec in specs}
@@ -197,14 +197,14 @@ class ManagerCore:
             container.desired = None
             self._release(container, "its manager was told to end")
 
-    def _release(self, container: Container, reason: str) -> None:
+    def _release(self, container: Container, reason: str, *, saves_states: bool = False) -> None:
         was = container.phase
         container.course.advance(LifeEvent.RELEASE)
         if container.phase is Phase.GONE:
             self._forget(container)
         elif was in {*ALIVE, Phase.STARTING}:
             if container.incarnation_id:
-                self._out.append(Stop(container.id, container.incarnation_id, reason))
+                self._out.append(Stop(container.id, container.incarnation_id, reason, saves_states))
             self._tell(container)
 
     # Events of containers

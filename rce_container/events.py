@@ -28,6 +28,8 @@ class Drop(Struct, frozen=True):
     id: str
     revision: int
     reason: str = ""
+    elsewhere: bool = False
+    """Whether it continues at another machine."""
 
 
 class Sync(Struct, frozen=True):
@@ -155,6 +157,8 @@ class Stop(Struct, frozen=True):
     incarnation_id: str
     reason: str = ""
     """The reason, for the record of that incarnation."""
+    saves_states: bool = False
+    """Whether the states of its nodes are saved first."""
 
 
 class Wait(Struct, frozen=True):
@@ -183,8 +187,8 @@ def event_of(message: m.Put | m.PatchSpec | m.StatusWanted | m.Drop | m.Sync) ->
             return Patch(patch)
         case m.StatusWanted(id=id_):
             return StatusWanted(id_)
-        case m.Drop(id=id_, revision=revision, reason=reason):
-            return Drop(id_, revision, reason)
+        case m.Drop(id=id_, revision=revision, reason=reason, elsewhere=elsewhere):
+            return Drop(id_, revision, reason, elsewhere)
         case m.Sync(endpoints=specs):
             return Sync(specs)
         case _:

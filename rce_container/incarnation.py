@@ -227,12 +227,14 @@ class Incarnation:
         return await self._node_states.save(self._channel, node)
 
     async def save_states(self) -> None:
-        """Save the states of all nodes that have services for it."""
-        contents = self._desired.contents.nodes if self._desired is not None else ()
+        """Save the states of all nodes that have services for it; the user is told of failures."""
+        contents = self._desired.contents.nodes if self._desired is not None and self.is_running else ()
         nodes = [node.tag for node in contents if node.state_services is not None]
         for node, error in zip(nodes, await asyncio.gather(*map(self.save_state, nodes)), strict=True):
             if error:
-                _log.warning("container %s: the state of node %s is not saved: %s", self.id, node, error)
+                text = f"the state of node {node} is not saved at its end: {error}"
+                _log.warning("container %s: %s", self.id, text)
+                self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
     def poll(self) -> None:
         """Ask for new :attr:`counters`, and report limits that were hit."""
@@ -242,18 +244,26 @@ class Incarnation:
         for text in self.enforcer.review():
             self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
 
-    def stop(self, reason: str = "") -> None:
+    def stop(self, reason: str = "", *, saves_states: bool = False) -> None:
         """Tell the environment to end; kill it if it does not.
 
         Args:
             reason: For the record of this incarnation.
+            saves_states: Whether the states of its nodes are saved first.
         """
+        if saves_states and self.is_running and not self._background.closed:
+            self._background.spawn(self._save_and_stop(reason), name=f"last snapshots of {self.id}")
+            return
         self._stopping = True
         self._stop_reason = reason or self._stop_reason
         if self._channel is not None:
             self._channel.send(m.encode(m.Stop()))
         if self._channel is not None or self._gives_files:
             self._limit(self._context.settings.stop_timeout)
+
+    async def _save_and_stop(self, reason: str) -> None:
+        await self.save_states()
+        self.stop(reason)
 
     def stop_over_limit(self, text: str) -> None:
         """End, because a volume is too full; it is made again when the volume may hold more."""

@@ -64,7 +64,7 @@ from rce_container.limits import ControlGroup, Limiter
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
-from rce_container.node_states import StateCarrier
+from rce_container.node_states import StateCarrier, save_all
 from rce_container.packages.supply import Library
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle, Runtime
@@ -297,7 +297,7 @@ class Manager:
                 await quit_.wait()
                 if self._snapshots is not None:
                     await self._snapshots.close()  # this machine is not to be given a container any more
-                await asyncio.gather(*(one.save_states() for one in self._incarnations.values()))
+                await save_all(self._incarnations.values())
                 self._feed(events.Quit())
                 self._start_waiting()
                 while self._incarnations:
@@ -356,8 +356,8 @@ class Manager:
                 self._incarnations[incarnation_id].apply(spec)
             case events.ApplyPatch(incarnation_id=incarnation_id, patch=patch):
                 self._incarnations[incarnation_id].apply_patch(patch)
-            case events.Stop(incarnation_id=incarnation_id, reason=reason):
-                self._incarnations[incarnation_id].stop(reason)
+            case events.Stop(incarnation_id=incarnation_id, reason=reason, saves_states=saves_states):
+                self._incarnations[incarnation_id].stop(reason, saves_states=saves_states)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
             case _:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import logging
 import socket
+import sys
 from itertools import count
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rce.aio.tasks import BackgroundTasks
 from rce.control import NODE_STATES, NodeStateError
@@ -21,10 +23,12 @@ from rce_container import intake
 from rce_container.environment import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
     from rce.control_channel.node_states import NodeStateClient
     from rce_container.environment.channel import Channel
+
+_log = logging.getLogger(__name__)
 
 _AT_ONCE = 4
 _OF_ONE_USER = 2
@@ -35,6 +39,12 @@ _TRANSFER_S = 30.0
 """Seconds that an environment may take to give or take a snapshot."""
 _SAVE_S = 15.0
 """Seconds that an environment may take to save a node's state on request."""
+_ORDERS_AT_ONCE = 64
+_ORDERS_OF_ONE_USER = 32
+"""Saves on request; others wait, so that no more snapshots are under way than are carried in time."""
+_ALL_S = 30.0
+"""Seconds in which the states of all nodes of a machine are saved at its end; nodes that hang take longer."""
+_ENDED = "its container ended"
 _CHUNK = 1 << 18
 SIZE_BYTES = 8
 """A snapshot to an environment begins with its size."""
@@ -52,6 +62,8 @@ class StateCarrier:
         self._process = process
         self._client = client
         self._turns = Turns(_AT_ONCE, waiting=_MAX_WAITING, each=_OF_ONE_USER)
+        self.orders = Turns(_ORDERS_AT_ONCE, waiting=sys.maxsize, each=_ORDERS_OF_ONE_USER)
+        """Of saves on request."""
         self._features: frozenset[str] | None = None
         """Of the master; None while there is none."""
 
@@ -145,6 +157,12 @@ class ContainerStates:
         Returns:
             Why it is not saved; empty if the snapshot is acknowledged.
         """
+        async with self._carrier.orders.turn(EndpointId.parse(self._id).user):
+            if self._tasks.closed:
+                return _ENDED
+            return await self._order(channel, node)
+
+    async def _order(self, channel: Channel, node: str) -> str:
         number = next(self._numbers)
         order: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._orders[number] = order
@@ -161,7 +179,7 @@ class ContainerStates:
         """Stop carrying."""
         for order in self._orders.values():
             if not order.done():
-                order.set_result("its container ended")
+                order.set_result(_ENDED)
         await self._tasks.close()
 
     async def _answer(self, channel: Channel, said: m.StateWanted | m.StateOffered) -> None:
@@ -203,6 +221,22 @@ class ContainerStates:
             self._carrier.question, self._id, self._incarnation_id, said, state
         )
         await self._carrier.keep(question, state)
+
+
+class Savable(Protocol):
+    """A container with nodes."""
+
+    async def save_states(self) -> None:
+        """Save the states of its nodes."""
+
+
+async def save_all(containers: Iterable[Savable]) -> None:
+    """Save the states of all containers' nodes, as far as there is time for it before the machine ends."""
+    try:
+        async with asyncio.timeout(_ALL_S):
+            await asyncio.gather(*(one.save_states() for one in containers))
+    except TimeoutError:
+        _log.warning("some states of nodes are not saved: that takes longer than %.0f s", _ALL_S)
 
 
 async def _collect(channel: Channel, said: m.StateOffered) -> bytes:

@@ -25,7 +25,7 @@ from rce.control.node_states import (
     encode,
     read_question,
 )
-from rce.model import MAX_STATE
+from rce.model import MAX_STATE, EndpointId
 from rce_master.exceptions import FencedError, MasterError
 from rce_master.state import commands, saved_states
 from rce_master.state.volume_records import SavedState
@@ -175,9 +175,19 @@ class NodeStateServer:
         except (MasterError, ControlError) as refusal:
             error = str(refusal)
         if error:
-            _log.warning(
-                "%s/%s moves with the state that was saved before: %s", question.id, question.node, error
-            )
+            await self._tell(question, f"moves with the state that was saved before: {error}")
+
+    async def _tell(self, question: Fetch, what: str) -> None:
+        """Tell the user about a node."""
+        _log.warning("%s/%s %s", question.id, question.node, what)
+        tag = EndpointId.parse(question.id).tag
+        fault = commands.FaultReported(id=question.id, text=f"container {tag}: node {question.node} {what}")
+        try:
+            await self._state_service.submit(fault)
+        except FencedError:
+            raise
+        except MasterError as refusal:  # the user was removed meanwhile, or the disk is full
+            _log.debug("%s is not told: %s", question.id, refusal)
 
 
 async def _pieces(socket: ServerConnection, size: int) -> AsyncIterator[bytes]:

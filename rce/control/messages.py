@@ -330,7 +330,7 @@ class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
     revision: int
     reason: str = ""
     elsewhere: bool = False
-    """Whether the robot is to connect again, at another task set."""
+    """Whether it continues at another task set: a robot connects again, nodes' states are saved first."""
 
 
 class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):

@@ -57,7 +57,7 @@ class Withdrawal:
     revision: int
     reason: str
     elsewhere: bool = False
-    """Whether the robot is to connect again, at another task set."""
+    """Whether it continues at another task set: a robot connects again, nodes' states are saved first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class Transaction:
             process: The task set.
             endpoint: Its id.
             reason: For its user.
-            elsewhere: Whether the robot is to connect again, at another task set.
+            elsewhere: Whether it continues at another task set (:class:`rce.control.Drop`).
         """
         revision = self.next_number("revision")
         self.changes.withdrawals.append(Withdrawal(process, endpoint, revision, reason, elsewhere))

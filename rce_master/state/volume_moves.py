@@ -4,7 +4,7 @@ A container without volumes is copied while it continues (:mod:`rce_master.state
 files cannot be in two places, so it is *held*: while there is a :class:`VolumeMove`, no task set is told to
 run it.
 
-1. STOPPING: its machine ends it, so that its nodes end properly.
+1. STOPPING: its machine saves the states of its nodes and ends it, so that they end properly.
 2. SAVING: its machine sends a snapshot of each volume to the masters, which need only what they lack.
 3. RESTORING: the next machine makes the files. A container whose machine is lost begins here.
 4. It belongs to the next machine. The former folders are removed when it is up there.
@@ -39,7 +39,8 @@ def begin(tx: Transaction, container: Container, to: str) -> None:
     tx.put(VolumeMove(id=container.id, to=to, phase=phase, since=tx.now))
     tx.put(replace(tx.tables.container_live(container.id), stays=""))
     if tx.tables.is_connected(container.task_set):
-        tx.withdraw(container.task_set, container.id, "it moves to another machine with its volumes")
+        reason = "it moves to another machine with its volumes"
+        tx.withdraw(container.task_set, container.id, reason, elsewhere=True)
     tx.happen("container_moving", container.id, f"from {container.task_set} to {to}, with its volumes")
 
 

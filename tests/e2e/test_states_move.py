@@ -254,6 +254,33 @@ async def test_a_count_moves_with_a_volume(folder: Path) -> None:
         await cloud.call("DELETE", "/containers/C")
 
 
+async def test_a_state_is_saved_when_it_moves_with_a_volume(folder: Path) -> None:
+    """It was never saved before; the node has it again at the next machine, and is saved there for a move."""
+    async with single(folder) as (_, cloud):
+        await cloud.start(cloud.machines[0])
+        volume = {"name": "files", "path": "/data", "size": "16M"}
+        await cloud.call("POST", "/containers", {"tag": "C", "volumes": [volume]})
+        services = {"save": "save_count", "restore": "restore_count", "every": 86400}
+        await cloud.call("POST", "/containers/C/nodes", FIXED | {"state_services": services})
+
+        async def runs() -> bool:
+            (node,) = (await cloud.call("GET", "/nodes"))["nodes"]
+            return bool(node["state"] == "running")
+
+        await until(runs, timeout=WAIT_S, what="the node runs")
+        await cloud.start(cloud.machines[1])
+        await cloud.call("PUT", "/containers/C/machine", {"machine": "second"})
+        await cloud.is_up_at("second")
+        first = await cloud.state()
+        assert first["machine"] == "first"
+        await until(runs, timeout=WAIT_S, what="the node runs there")
+        await cloud.call("PUT", "/machines/second/drain")
+        await cloud.is_up_at("first")
+        state = await cloud.state()
+        assert (state["machine"], state["sha256"]) == ("second", first["sha256"])
+        await cloud.call("DELETE", "/containers/C")
+
+
 async def test_a_state_that_was_removed_moves(folder: Path) -> None:
     """It has not changed since its snapshot, and the node that has it is saved for the move."""
     async with single(folder) as (_, cloud):

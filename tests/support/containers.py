@@ -227,9 +227,9 @@ class Machine:
     async def put(self, id_: str, revision: int = 1, **parts: Unpack[ContainerParts]) -> None:
         await self.manager.handle(Put(endpoint=container(id_, revision, **parts)))
 
-    async def drop(self, id_: str, revision: int = 100) -> None:
+    async def drop(self, id_: str, revision: int = 100, *, elsewhere: bool = False) -> None:
         self.note_processes()
-        await self.manager.handle(Drop(id=id_, revision=revision))
+        await self.manager.handle(Drop(id=id_, revision=revision, elsewhere=elsewhere))
         await until(lambda: any(m.id == id_ for m in self.of(Gone)), what=f"{id_} is gone")
 
     async def node_is(self, id_: str, tag: str, state: NodeState) -> NodeStatus:

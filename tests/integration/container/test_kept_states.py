@@ -177,6 +177,25 @@ async def test_a_state_is_saved_on_request_and_before_the_end(machine: Machine) 
     assert keeper.states["grow"] == b"restored xxxx", "the manager was told to end"
 
 
+async def test_states_are_saved_before_a_container_ends_for_a_move(machine: Machine) -> None:
+    """One with volumes ends before it starts elsewhere; one that is destroyed is not saved."""
+    keeper = Keeper(grow=b"restored ")
+    async with kept(machine, keeper):
+        for elsewhere, state in ((True, b"restored x"), (False, b"restored x")):
+            await machine.put(BOX, nodes=(own("grow", "grow.py", RARELY),))
+            await machine.node_is(BOX, "grow", NodeState.RUNNING)
+            await machine.drop(BOX, elsewhere=elsewhere)
+            assert keeper.states["grow"] == state
+            machine.told.clear()
+        await machine.put(BOX, nodes=(own("grow", "grow.py", RARELY),))
+        await machine.node_is(BOX, "grow", NodeState.RUNNING)
+        keeper.fault = "the disk is full"
+        await machine.drop(BOX, elsewhere=True)
+        (fault,) = machine.faults
+        assert "container box: the state of node grow is not saved at its end: " in fault
+        assert "the disk is full" in fault
+
+
 async def test_nodes_that_cannot_be_saved_harm_no_other(machine: Machine) -> None:
     keeper = Keeper(count=b"1000")
     nodes = (own("deaf", "deaf.py"), own("huge", "huge.py"), own("none", "talk.py"), counter())

@@ -57,6 +57,12 @@ async def listed(site: Site) -> list[dict[str, Any]]:
     return list((await site.api("GET", "/states"))["states"])
 
 
+async def faults(site: Site) -> list[str]:
+    headers = {"Authorization": f"Bearer {site.token}", "Accept": "application/json"}
+    async with site.session.get(f"{site.url}api/v1/events", headers=headers) as reply:
+        return [one["text"] for one in (await reply.json())["events"] if one["kind"] == "fault"]
+
+
 async def report(site: Site, task_set: TaskSet, incarnation: str) -> None:
     """Report the container, and wait until the master knows it."""
     task_set.report(EndpointStatus(id=C, revision=1, state=EndpointState.RUNNING, incarnation=incarnation))
@@ -170,6 +176,8 @@ async def test_a_container_that_moves_saves_once_more(site: Site) -> None:
             order = await there.get(SaveState)
             there.channel.send(StateSaved(request=order.request, error="it hangs"))
             assert await asking == b"second"
+            (told,) = await faults(site)
+            assert told == "container C: node n moves with the state that was saved before: it hangs"
         with pytest.raises(NodeStateError, match="at another machine"):
             await fetched(site, "c2")
 

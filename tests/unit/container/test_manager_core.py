@@ -79,6 +79,11 @@ def test_drop_stops_and_says_gone_when_nothing_is_left() -> None:
     assert not manager.containers
 
 
+def test_drop_of_what_continues_elsewhere_saves_its_states() -> None:
+    out = running().handle(events.Drop(ID, 7, "it moves", elsewhere=True), 1.0)
+    assert events.Stop(ID, "one", "it moves", saves_states=True) in out
+
+
 def test_drop_of_what_is_not_there_says_gone_at_once() -> None:
     assert told(ManagerCore().handle(events.Drop(ID, 3), 0.0), Gone) == [Gone(id=ID, revision=3)]
 

@@ -30,7 +30,9 @@ PHASES = [VolumeMovePhase.STOPPING, VolumeMovePhase.SAVING, VolumeMovePhase.REST
 def test_a_container_moves_with_its_volume() -> None:
     world = Moving()
     changes = world.move()
-    assert [(one.process, one.id) for one in changes.withdrawals] == [("c1", "anna/c")]
+    (drop,) = changes.withdrawals
+    assert (drop.process, drop.id) == ("c1", "anna/c")
+    assert drop.elsewhere, "states are saved before its end"
     assert not world.runs_at("c1")
     assert (world.orders("c1"), world.orders("c2")) == ([], [])
     world.gone()
