@@ -86,7 +86,7 @@ async def kill_leader(urls: Sequence[str]) -> LeaderView:
 
 
 class MasterKills:
-    """Kills the leading master at random moments, and measures how another one takes over.
+    """Kills the leading master at random moments while robots drive, and measures how another one takes over.
 
     Args:
         urls: The masters.
@@ -131,7 +131,7 @@ class MasterKills:
         """What went wrong, in words."""
         found = [self.fault] if self.fault else []
         if not self.changes and not self.fault:
-            found.append("the leading master was not killed: the run was too short")
+            found.append("the leading master was not killed: the run was too short, or no robot drove")
         return found
 
     def as_json(self) -> dict[str, Any]:
@@ -154,6 +154,8 @@ class MasterKills:
     async def _run(self) -> None:
         async with aiohttp.ClientSession(timeout=_TIMEOUT) as session:
             while not self.fault and not await self._is_ending(self._rng.uniform(*CALM_S)):
+                if not await self._see_robots_drive():
+                    return
                 try:
                     leader = await kill_leader(self._urls)
                 except DemoError:
@@ -181,6 +183,14 @@ class MasterKills:
             f"{leader.url} leads in term {leader.term} after {waited:.1f} s; the robots drove"
             f" {driven:.2f} m meanwhile"
         )
+
+    async def _see_robots_drive(self) -> bool:
+        """Wait until a robot drives, as a kill while all stand shows nothing; False: the run ends before."""
+        before = sum(self._places().values())
+        while sum(self._places().values()) <= before:
+            if await self._is_ending(_POLL_S):
+                return False
+        return True
 
     def _places(self) -> Mapping[str, float]:
         """Return how far each robot has driven until now, metres."""

@@ -50,6 +50,8 @@ async def test_robots_drive_while_leading_masters_are_killed() -> None:
     assert masters["kills"] >= 1
     terms = [change["term"] for change in masters["changes"]]
     assert terms == sorted(set(terms))
+    # A kill comes while a robot drives, so also on a slow machine one drives until the next master leads.
+    assert min(change["driven_m"] for change in masters["changes"]) > 0
     assert report["collisions"] == 0
     assert report["tasks_done"] >= 1
     assert report["tasks_lost"] == 0
