@@ -77,7 +77,7 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
             lambda e: joining.run(e, robots=200 if quick else 1000),
         ),
         "failover": (
-            "A robot task set ends or is drained, and its robots are at another one",
+            "A robot task set ends, hangs or is drained, and its robots are at another one",
             lambda _: failover.run(robots=200, passes=1 if quick else 3),
         ),
         "states": (

@@ -1,4 +1,4 @@
-"""A robot task set ends or is drained: how long its robots take until they are at another one.
+"""A robot task set ends, hangs or is drained: how long its robots take until they are at another one.
 
 They have all that they had there.
 """
@@ -25,9 +25,16 @@ from rce_client import Connection
 
 CONTAINER, STRING = "planner", "std_msgs/String"
 TARGET_S = 2.0
+HUNG_TARGET_S = 20.0
+"""A hung one ends no connection: others refuse its robots until the master misses it, for up to 13 s."""
 WAIT_S = 120.0
-DRAINED = "drained (rce drain)"
-WAYS = {"killed (-9)": signal.SIGKILL, "stopped (SIGTERM)": signal.SIGTERM, DRAINED: None}
+DRAINED, HUNG = "drained (rce drain)", "hung (SIGSTOP)"
+WAYS = {
+    "killed (-9)": signal.SIGKILL,
+    "stopped (SIGTERM)": signal.SIGTERM,
+    DRAINED: None,
+    HUNG: signal.SIGSTOP,
+}
 """How a robot task set ends; None: it runs on, and takes no robots."""
 
 
@@ -113,7 +120,7 @@ async def _read(child: Child) -> None:
 
 
 async def run(*, robots: int, passes: int) -> list[dict[str, Any]]:
-    """End or drain the robot task set of all robots, beside one that is empty; one row for each time."""
+    """Make all robots leave their robot task set for an empty one in each way; one row for each time."""
     folder = Path(tempfile.mkdtemp(prefix="rce-bench-", dir="/tmp"))
     parts = _Parts(folder)
     rows = []
@@ -140,6 +147,8 @@ async def run(*, robots: int, passes: int) -> list[dict[str, Any]]:
                     rows.append(
                         _row(way, robots, seconds, _cpu(processes) - before, len(os.sched_getaffinity(0)))
                     )
+                    if number is signal.SIGSTOP:
+                        os.kill(there.pid, signal.SIGKILL)  # it hears no SIGTERM
                     await there.stop(timeout=60)
                     for robot in fleet:
                         robot.lost.clear()
@@ -154,7 +163,7 @@ def _row(way: str, robots: int, seconds: float, cpu_s: float, cores: int) -> dic
         "robot task set": way,
         "robots": robots,
         "seconds until all are elsewhere": round(seconds, 2),
-        "target": TARGET_S,
+        "target": HUNG_TARGET_S if way == HUNG else TARGET_S,
         "CPU seconds of engine": round(cpu_s, 2),
         "load": round(os.getloadavg()[0], 1),
         "cores": cores,

@@ -322,7 +322,7 @@ TARGETS = [
     Target(
         "a robot task set ends: its 200 robots are at another one, with all that they had",
         "failover",
-        _greatest("seconds until all are elsewhere", robots=200),
+        _greatest("seconds until all are elsewhere", robots=200, target=failover.TARGET_S),
         2,
         "s",
     ),
@@ -331,6 +331,13 @@ TARGETS = [
         "failover",
         _greatest("seconds until all are elsewhere", **{"robot task set": failover.DRAINED, "robots": 200}),
         2,
+        "s",
+    ),
+    Target(
+        "a robot task set hangs: the same",
+        "failover",
+        _greatest("seconds until all are elsewhere", **{"robot task set": failover.HUNG, "robots": 200}),
+        20,
         "s",
     ),
     Target(
