@@ -1,21 +1,27 @@
-"""The container of the fleet moves between machines: no accepted task is lost, and none runs twice."""
+"""The container of the fleet moves between machines: no accepted task is lost, and none runs twice.
+
+If its machine is lost, it continues elsewhere with the tasks of its newest snapshot.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import aiohttp
+import psutil
 import pytest
 from support.demo import Demo, environment, running_demo
-from support.engine import Program, until
+from support.engine import Program, engine_processes, until
 from support.ports import free_port
 
-from rce_fleet.wiring import FLEET_CONTAINER
+from rce_fleet.wiring import FLEET_CONTAINER, VOLUME
 
 pytestmark = [
     pytest.mark.e2e,
@@ -48,8 +54,8 @@ class Api:
 
 
 @asynccontextmanager
-async def second_machine(demo: Demo, folder: Path) -> AsyncIterator[None]:
-    """Run a second machine for containers of the demo's engine."""
+async def second_machine(demo: Demo, folder: Path) -> AsyncIterator[Program]:
+    """Run a second machine for containers of the demo's engine; the test may lose it."""
     argv = [
         *(str(Path(sys.executable).parent / "rce-container"), "127.0.0.1", "--dev", "--machine", SECOND),
         *("--control-port", str(demo.ports.control), "--link-port", str(free_port())),
@@ -58,9 +64,19 @@ async def second_machine(demo: Demo, folder: Path) -> AsyncIterator[None]:
     program = Program(SECOND, argv, environment(demo.folder), folder)
     await program.start()
     try:
-        yield
+        yield program
     finally:
-        assert await program.stop() == 0, program.output()
+        if program.running:
+            assert await program.stop() == 0, program.output()
+
+
+async def lose(machine: Program, folder: Path) -> None:
+    """Kill -9 a container task set and all that it started, as when its machine is switched off."""
+    found = engine_processes(folder)
+    await machine.kill()
+    for process in found:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
 
 
 @asynccontextmanager
@@ -142,3 +158,46 @@ async def test_the_fleet_moves_and_loses_no_task(tmp_path: Path) -> None:
         names = [(event["id"], event["name"]) for event in events]
         for task in tasks:
             assert [names.count((task, name)) for name in ("created", "arrived", "finished")] == [1, 1, 1]
+
+
+async def test_tasks_of_a_snapshot_outlive_the_machine(tmp_path: Path) -> None:
+    async with (
+        running_demo("--robots", 3, "--full-stack", 0, "--no-auto", "--seed", 2) as demo,
+        second_machine(demo, tmp_path) as second,
+        aiohttp.ClientSession(demo.page, timeout=aiohttp.ClientTimeout(total=LONGEST_S)) as session,
+        master_api(demo) as master,
+    ):
+        station = Api(session)
+        cells = await free_cells(station)
+        await master.ask("PUT", f"/containers/{FLEET_CONTAINER}/machine", {"machine": SECOND})
+        await is_at(master, SECOND)
+        tasks = []
+        for number in range(6):
+            stops = [{"action": "go", "cell": cells[(7 * number) % len(cells)]}]
+            order = await station.ask("POST", "/tasks", {"stops": stops}, Idempotency_Key=f"order-{number}")
+            tasks.append(order["id"])
+        # The time of a snapshot is that of its end: the one that ends next may have begun before the tasks.
+        await is_saved(master, after=await is_saved(master, after=time.time()))
+        await lose(second, tmp_path / SECOND)
+        machines = (await master.ask("GET", "/machines"))["machines"]
+        (first,) = {one["machine"] for one in machines if one["kind"] == "container"} - {SECOND}
+        await is_at(master, first)
+
+        async def are_done() -> bool:
+            shown = [await station.ask("GET", f"/tasks/{task}") for task in tasks]
+            return all(one["state"] == "done" for one in shown)
+
+        await until(are_done, timeout=LONGEST_S, what="all tasks are known there, and are done")
+
+
+async def is_saved(master: Api, *, after: float) -> float:
+    """Wait for a snapshot of the journal's volume after a time; return when it was taken."""
+
+    async def newest() -> float:
+        found = (await master.ask("GET", "/volumes"))["volumes"]
+        (volume,) = (one for one in found if one["name"] == VOLUME["name"])
+        assert not volume["fault"]
+        taken = float(volume["snapshot"] or 0.0)
+        return taken if taken > after else 0.0
+
+    return await until(newest, timeout=LONGEST_S, what="the journal's volume is saved")
