@@ -80,8 +80,8 @@ class ArchiveCopies:
         self._client = client
         self._tasks = BackgroundTasks()
         self._wanted = asyncio.Event()
-        self._removal = asyncio.Lock()
-        """Held while another master removes an archive, which must not be pushed meanwhile."""
+        self._removals: dict[tuple[str, str], asyncio.Event] = {}
+        """Set when a master has removed an archive, which must not be pushed before: by names, and hashes."""
         self._pushed: Counter[str] = Counter()
         """Hashes of archives that may get a package soon."""
         self._sending: set[tuple[str, str]] = set()
@@ -140,15 +140,21 @@ class ArchiveCopies:
         Raises:
             StoreError: Too few masters have it; it has to be pushed again.
         """
-        async with self._removal:
-            self._pushed.update(archives)
+        self._pushed.update(archives)
         try:
+            await self._removed(archives)
             others = await self._registry.others()
             await self._send_to_majority(archives, others)
             yield self._note_alone(is_alone=not others)
         finally:
             self._pushed -= Counter(archives)
             self.look()
+
+    async def _removed(self, archives: Collection[str]) -> None:
+        """Wait until no other master is removing any of these archives; each removal is short."""
+        for (_, sha256), ended in list(self._removals.items()):
+            if sha256 in archives:
+                await ended.wait()
 
     def _note_alone(self, *, is_alone: bool) -> str:
         """Return the warning for the owner of what was spread, and log it once for the operator."""
@@ -320,13 +326,17 @@ class ArchiveCopies:
         for number, sha256 in enumerate(held - listed, 1):
             if number % _PIECE == 0:
                 await asyncio.sleep(0)
-            async with self._removal:
-                # Asked again: what is not needed now may have become so since the list was made.
-                if sha256 in self._pushed or needed.is_needed(sha256):
-                    continue
-                if not needed.is_complete():
-                    return
+            # Asked again: what is not needed now may have become so since the list was made.
+            if sha256 in self._pushed or needed.is_needed(sha256):
+                continue
+            if not needed.is_complete():
+                return
+            ended = self._removals[other.name, sha256] = asyncio.Event()
+            try:
                 await self._client.remove(other, sha256)
+            finally:
+                del self._removals[other.name, sha256]
+                ended.set()
 
     def _note(self, name: str, fault: str) -> None:
         if fault and fault != self._faults.get(name):

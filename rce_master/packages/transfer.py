@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from rce_master.packages.contents import ContentStore
     from rce_master.store.etcd.layout import OtherMaster
 
+REMOVAL_S = 3.0
+"""How long a removal may take; a push of the same archive waits for it."""
+
 
 class ArchiveClient:
     """Asks other masters about archives.
@@ -85,5 +88,6 @@ class ArchiveClient:
             StandbyError: It did not.
             FencedError: This master leads no more.
         """
-        async with self._client.ask(master, hdrs.METH_DELETE, f"{self._path}/{sha256}"):
+        path = f"{self._path}/{sha256}"
+        async with self._client.ask(master, hdrs.METH_DELETE, path, answer_s=REMOVAL_S):
             pass

@@ -14,6 +14,7 @@ import aiohttp
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from aiohttp.typedefs import Handler
 from support.engine import until
 from support.ports import free_port
 
@@ -88,14 +89,40 @@ class Counted:
         return self.complete
 
 
+class Gate:
+    """Holds back what a stand-by is asked for, as if it hung.
+
+    Attributes:
+        method: Of the requests that are held back; empty: none are.
+        held: How many were held back so far.
+    """
+
+    def __init__(self) -> None:
+        self.method = ""
+        self.held = 0
+        self._opened = asyncio.Event()
+
+    def open(self) -> None:
+        self.method = ""
+        self._opened.set()
+
+    @web.middleware
+    async def wait(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        if request.method == self.method:
+            self.held += 1
+            await self._opened.wait()
+        return await handler(request)
+
+
 class Pair:
     """A leading master's copies, and the folder of a stand-by."""
 
-    def __init__(self, copies: ArchiveCopies, registry: Known, own: Path, others: Path) -> None:
+    def __init__(self, copies: ArchiveCopies, registry: Known, own: Path, others: Path, gate: Gate) -> None:
         self.copies = copies
         self.registry = registry
         self.own = own
         self.others = others
+        self.gate = gate
 
     @asynccontextmanager
     async def comparing(self, needed: Counted, forget: Forget | None = None) -> AsyncIterator[None]:
@@ -109,7 +136,8 @@ class Pair:
 @pytest.fixture
 async def pair(tmp_path: Path) -> AsyncIterator[Pair]:
     own, others = tmp_path / "own", tmp_path / "others"
-    app = web.Application()
+    gate = Gate()
+    app = web.Application(middlewares=[gate.wait])
     ArchiveRoutes(ContentStore(others), LeaderCheck(KEY, lambda: 1), ARCHIVES_PATH).add_to(app)
     core = LeadershipCore(LeaseSettings())
     core.granted(0.0, 3.0)
@@ -120,7 +148,8 @@ async def pair(tmp_path: Path) -> AsyncIterator[Pair]:
         copies = ArchiveCopies(
             ContentStore(own), cast("MasterRegistry", registry), ArchiveClient(client, ARCHIVES_PATH)
         )
-        yield Pair(copies, registry, own, others)
+        yield Pair(copies, registry, own, others, gate)
+        gate.open()
 
 
 async def test_many_held_contents_are_listed_once(pair: Pair) -> None:
@@ -148,6 +177,30 @@ async def test_contents_that_are_sent_are_not_removed(pair: Pair) -> None:
         async with pair.copies.spread(*pushed[:2]), pair.copies.spread(*pushed[:1]):
             await until(lambda: not (pair.others / pushed[2]).exists())
             assert (pair.others / pushed[0]).exists()
+
+
+async def test_a_silent_standby_does_not_delay_other_pushes(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only a push of the same content waits for the end of a removal, and then sends it again."""
+    monkeypatch.setattr("rce_master.packages.transfer.REMOVAL_S", 3600.0)
+    (pushed,), (removed,) = write(pair.own, b"pushed"), write(pair.others, b"removed")
+    write(pair.own, b"removed")
+    pair.gate.method = "DELETE"
+
+    async def push(content: str) -> bool:
+        async with pair.copies.spread(content):
+            return (pair.others / content).exists()
+
+    async with pair.comparing(Counted(())):
+        await until(lambda: pair.gate.held)
+        async with asyncio.timeout(60):
+            assert await push(pushed), "while the removal of the other one is not answered"
+        pushing_again = asyncio.create_task(push(removed))
+        await push(pushed)
+        assert not pushing_again.done()
+        pair.gate.open()
+        assert await pushing_again
 
 
 async def test_a_master_that_is_alone_warns_of_one_copy(pair: Pair, caplog: pytest.LogCaptureFixture) -> None:
