@@ -64,6 +64,7 @@ class StandbyClient:
         size: int = 0,
         data: object = None,
         answer_s: float = ANSWER_S,
+        silence_s: float | None = None,
     ) -> AsyncIterator[aiohttp.ClientResponse]:
         """Send a request, and give its answer if that is a success.
 
@@ -75,6 +76,7 @@ class StandbyClient:
             size: Bytes that are transferred, at most.
             data: The body.
             answer_s: Seconds that the answer may take, beside connecting and transferring.
+            silence_s: Seconds without any of the answer, once all was sent; None: they are not limited apart.
 
         Raises:
             StandbyError: There was another answer, or none.
@@ -92,6 +94,7 @@ class StandbyClient:
                     data=data,
                     allow_redirects=False,
                     ssl=self._tls() if self._tls is not None else True,
+                    timeout=aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=silence_s),
                 ) as reply,
             ):
                 if reply.status not in (HTTPStatus.OK, HTTPStatus.NO_CONTENT):
@@ -99,5 +102,10 @@ class StandbyClient:
                     raise StandbyError(f"{master.name}: answered {reply.status}: {text}")
                 yield reply
         except (aiohttp.ClientError, OSError, CertificateError) as error:  # a time-out is an OSError
-            why = explain_to_client(error) or str(error) or "no answer in time"
-            raise StandbyError(f"{master.name}: {why}") from error
+            raise failure(master, error) from error
+
+
+def failure(master: OtherMaster, error: Exception) -> StandbyError:
+    """Return what a failed connection means for the one who asked."""
+    why = explain_to_client(error) or str(error) or "no answer in time"
+    return StandbyError(f"{master.name}: {why}")

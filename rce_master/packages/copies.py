@@ -12,7 +12,7 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from errno import EAGAIN
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
@@ -21,7 +21,7 @@ from rce_master.exceptions import FencedError, StoreError
 from rce_master.leadership.standby_client import StandbyError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Sequence
 
     from rce_master.leadership.registry import MasterRegistry
     from rce_master.packages.contents import ContentStore
@@ -34,6 +34,8 @@ LOOK_S = 10.0
 """Longest time from one comparison with the other masters to the next."""
 WAIT_S = 5.0
 """How long a task set waits for an archive that this master fetches; then it asks again."""
+HELD_S = 5.0
+"""How long another master may take to list its archives, before those of the others are fetched."""
 LOST_S = 900.0
 """A needed archive counts as lost if for so long no other master had it, and all of them answer. After the
 engine has been down for days, they get to know each other one by one."""
@@ -86,6 +88,8 @@ class ArchiveCopies:
         """Hashes of archives that may get a package soon."""
         self._sending: set[tuple[str, str]] = set()
         """Names of masters, and hashes."""
+        self._failed: set[str] = set()
+        """Names of masters that did not give an archive, or a list of theirs, when they were asked last."""
         self._fetching: dict[str, asyncio.Task[None]] = {}
         self._absent: dict[str, float] = {}
         """Since when no master is known that has a needed archive: hashes, and times."""
@@ -233,15 +237,26 @@ class ArchiveCopies:
 
     async def _fetch_from_any(self, sha256: str) -> None:
         reasons = []
-        for other in await self._registry.others():
+        others = await self._registry.others()
+        for other in sorted(others, key=lambda one: one.name in self._failed):  # a silent one takes seconds
             try:
-                await self._client.fetch(other, sha256, self._store)
+                with self._noting_failure(other):
+                    await self._client.fetch(other, sha256, self._store)
             except StandbyError as error:
                 reasons.append(str(error))
             else:
                 _log.info("fetched the archive %s from %s", sha256, other.name)
                 return
         raise StandbyError(f"no other master gives the archive: {'; '.join(reasons) or 'there is none'}")
+
+    @contextmanager
+    def _noting_failure(self, other: OtherMaster) -> Iterator[None]:
+        try:
+            yield
+        except StandbyError:
+            self._failed.add(other.name)
+            raise
+        self._failed.discard(other.name)
 
     # Comparing
 
@@ -255,13 +270,10 @@ class ArchiveCopies:
         except (OSError, StoreError) as error:
             why, others = str(error), []
         self._note("this master", f"packages are incomplete: {why}" if why else "")
-        for other in others:
-            try:
-                await self._complete(other, needed, own)
-            except StandbyError as error:
-                self._note(other.name, f"its packages are not compared: {error}")
-            else:
-                self._note(other.name, "")
+        completed = (self._complete(other, needed, own) for other in others)
+        for ended in await asyncio.gather(*completed, return_exceptions=True):
+            if ended is not None:
+                raise ended
 
     async def _fetch_missing(
         self, needed: NeededContents, others: Sequence[OtherMaster], own: set[str]
@@ -298,11 +310,16 @@ class ArchiveCopies:
         return f"{len(reasons)} are missing, such as {example}: {reasons[example]}"
 
     async def _held(self, others: Sequence[OtherMaster]) -> dict[str, set[str]]:
-        """Return what each of the other masters has that answers."""
-        held = {}
-        for other in others:
-            with suppress(StandbyError):
-                held[other.name] = await self._client.held(other)
+        """Return what each of the other masters has that answers soon."""
+        held: dict[str, set[str]] = {}
+
+        async def ask(other: OtherMaster) -> None:
+            with suppress(StandbyError), self._noting_failure(other):
+                held[other.name] = await self._client.held(other, answer_s=HELD_S)
+
+        for ended in await asyncio.gather(*map(ask, others), return_exceptions=True):
+            if ended is not None:
+                raise ended
         return held
 
     def _note_absent(self, absent: set[str], *, all_answered: bool) -> None:
@@ -317,8 +334,17 @@ class ArchiveCopies:
         return needed.hashes()
 
     async def _complete(self, other: OtherMaster, needed: NeededContents, own: set[str]) -> None:
+        try:
+            await self._make_equal(other, needed, own)
+        except StandbyError as error:
+            self._note(other.name, f"its packages are not compared: {error}")
+        else:
+            self._note(other.name, "")
+
+    async def _make_equal(self, other: OtherMaster, needed: NeededContents, own: set[str]) -> None:
         """Send another master what it lacks, and let it remove what no package has."""
-        held = await self._client.held(other)
+        with self._noting_failure(other):
+            held = await self._client.held(other)
         listed = await self._list(needed)
         for sha256 in (listed & own) - held:
             if (other.name, sha256) not in self._sending:

@@ -8,16 +8,22 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from aiohttp import hdrs
+from aiohttp import ClientError, hdrs
 
 from rce.packages import DEFAULT_LIMITS
-from rce_master.leadership.standby_client import StandbyError
+from rce_master.leadership.standby_client import ANSWER_S, StandbyError, failure
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from aiohttp import ClientResponse
+
     from rce_master.leadership.standby_client import StandbyClient
     from rce_master.packages.contents import ContentStore
     from rce_master.store.etcd.layout import OtherMaster
 
+SILENCE_S = 5.0
+"""How long a master that gives an archive may be silent, before and within its answer."""
 REMOVAL_S = 3.0
 """How long a removal may take; a push of the same archive waits for it."""
 
@@ -34,14 +40,18 @@ class ArchiveClient:
         self._client = client
         self._path = path
 
-    async def held(self, master: OtherMaster) -> set[str]:
+    async def held(self, master: OtherMaster, *, answer_s: float = ANSWER_S) -> set[str]:
         """Return the hashes of the archives that a master has.
+
+        Args:
+            master: Whom to ask.
+            answer_s: Seconds that it may take.
 
         Raises:
             StandbyError: It does not say.
             FencedError: This master leads no more.
         """
-        async with self._client.ask(master, hdrs.METH_GET, self._path) as reply:
+        async with self._client.ask(master, hdrs.METH_GET, self._path, answer_s=answer_s) as reply:
             return set((await reply.text()).split())
 
     async def send(self, master: OtherMaster, sha256: str, store: ContentStore) -> None:
@@ -73,9 +83,13 @@ class ArchiveClient:
         """
         async with (
             self._client.ask(
-                master, hdrs.METH_GET, f"{self._path}/{sha256}", size=DEFAULT_LIMITS.archive
+                master,
+                hdrs.METH_GET,
+                f"{self._path}/{sha256}",
+                size=DEFAULT_LIMITS.archive,
+                silence_s=SILENCE_S,
             ) as reply,
-            store.receive(reply.content.iter_any()) as incoming,
+            store.receive(_pieces(master, reply)) as incoming,
         ):
             if incoming.sha256 != sha256:
                 raise StandbyError(f"{master.name}: its archive is damaged")
@@ -91,3 +105,16 @@ class ArchiveClient:
         path = f"{self._path}/{sha256}"
         async with self._client.ask(master, hdrs.METH_DELETE, path, answer_s=REMOVAL_S):
             pass
+
+
+async def _pieces(master: OtherMaster, reply: ClientResponse) -> AsyncIterator[bytes]:
+    """Yield an archive; errors of the connection are told from those of this master's disk.
+
+    Raises:
+        StandbyError: The connection failed, or the other master was silent for too long.
+    """
+    try:
+        async for piece in reply.content.iter_any():
+            yield piece
+    except (ClientError, OSError) as error:
+        raise failure(master, error) from error

@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 from collections import Counter
 from collections.abc import AsyncIterator, Collection, Iterable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import cast
 
@@ -327,3 +327,54 @@ async def test_volumes_forget_snapshots_that_no_master_has(
         tasks.spawn(service.run(), name="snapshots")
         await until(lambda: left() == ["whole"])
         await until((pair.own / whole).exists)
+
+
+@asynccontextmanager
+async def silent_master(pair: Pair) -> AsyncIterator[list[str]]:
+    """Let the masters begin with one that hung within its answers; yield what was fetched from it."""
+    asked: list[str] = []
+    ended = asyncio.Event()
+
+    async def answer(request: web.Request) -> web.StreamResponse:
+        reply = web.StreamResponse()
+        reply.content_length = 1000
+        if request.path != ARCHIVES_PATH:
+            asked.append(request.path)
+            await reply.prepare(request)
+            await reply.write(b"the first bytes")
+        await ended.wait()
+        return reply
+
+    app = web.Application()
+    app.router.add_get(ARCHIVES_PATH, answer)
+    app.router.add_get(ARCHIVES_PATH + "/{sha256}", answer)
+    async with TestServer(app) as server:
+        pair.registry.masters.insert(0, OtherMaster("silent", str(server.make_url("/"))))
+        yield asked
+        ended.set()
+
+
+async def test_missing_contents_are_fetched_where_they_are_listed(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rce_master.packages.copies.HELD_S", 1.0, raising=False)
+    pair.own.mkdir()
+    there = write(pair.others, *(b"%d" % number for number in range(100)))
+    async with silent_master(pair) as asked, pair.comparing(Counted(there)):
+        await until(lambda: all((pair.own / name).exists() for name in there))
+    assert not asked
+
+
+async def test_master_that_goes_silent_within_a_content_is_left(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked last for the next ones."""
+    monkeypatch.setattr("rce_master.packages.transfer.SILENCE_S", 2.0, raising=False)
+    pair.own.mkdir()
+    there = write(pair.others, *(b"%d" % number for number in range(100)))
+    async with silent_master(pair) as asked, asyncio.timeout(60):
+        for name in there:
+            while not (pair.own / name).exists():
+                with suppress(OSError):  # it is being fetched yet
+                    await pair.copies.obtain(name)
+    assert len(asked) == 1
