@@ -15,6 +15,7 @@ from pathlib import Path
 from rce.config import Secret, ShippedFileError, configs_dir, default_state_dir, examples_dir, run_dir
 from rce.control import MachineInfo, VolumeLimit
 from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.connections import OpenConnections
 from rce.control_channel.contents import ContentClient
 from rce.control_channel.dialing import RunDialer
 from rce.control_channel.node_states import NodeStateClient
@@ -143,13 +144,14 @@ class App:
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
-                client = ContentClient(masters, self.secret, tls=tls)
+                beside = OpenConnections()
+                client = ContentClient(masters, self.secret, tls=tls, connections=beside)
                 library = await asyncio.to_thread(self._library, state, client)
                 reach = self.host
                 if is_any(reach):
                     first = split_port(split_addresses(self.master)[0], self.control_port)
                     reach = await own_address(*first, quitting.told)
-                dialer = RunDialer(masters, self.secret, tls=tls)
+                dialer = RunDialer(masters, self.secret, tls=tls, connections=beside)
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail, limit),
@@ -168,7 +170,13 @@ class App:
                 )
                 terms = Terms(state.term, state.keep_term)
                 channel = TaskSetChannel(
-                    masters, self.secret, manager.hello, manager.handle, tls=tls, terms=terms
+                    masters,
+                    self.secret,
+                    manager.hello,
+                    manager.handle,
+                    tls=tls,
+                    terms=terms,
+                    connections=beside,
                 )
                 await _manage(manager, channel, quitting.of(manager), lambda: ready(name, runtime.name))
 

@@ -47,6 +47,7 @@ from rce.control import (
     decode_to_task_set,
     encode,
 )
+from rce.control_channel.connections import OpenConnections
 from rce.control_channel.dialing import TaskSetConnection
 from rce.control_channel.terms import Terms
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
@@ -111,6 +112,7 @@ class TaskSetChannel:
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
         terms: Remembers the newest term of leadership, so that no master of an older one is listened to.
+        connections: Those beside the channel, which end with the leadership of their master.
     """
 
     def __init__(
@@ -123,7 +125,9 @@ class TaskSetChannel:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         tls: Context | None = None,
         terms: Terms | None = None,
+        connections: OpenConnections | None = None,
     ) -> None:
+        self._connections = connections or OpenConnections()
         self._terms = terms or Terms()
         self._masters = url if isinstance(url, Masters) else Masters(url)
         self._url = self._masters.current
@@ -294,6 +298,7 @@ class TaskSetChannel:
                 finally:
                     if isinstance(socket, TaskSetConnection) and socket.is_silent:  # hung, or cut off
                         self._worked = False
+                        self._connections.note_silent(self._url)
                     await socket.close()  # a cancelled context manager would report an internal error
         except InvalidStatus as error:
             status = error.response.status_code
@@ -381,6 +386,7 @@ class TaskSetChannel:
                 self._welcomed.set()
                 self._worked = True
                 self._masters.worked()
+                self._connections.note_leader(self._url)
                 await self._inbox.put(message)
             case Refused():
                 raise _RefusedError(message.reason)

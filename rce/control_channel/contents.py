@@ -19,6 +19,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 from rce.control import ContentError
+from rce.control_channel.connections import OpenConnections
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_socket
 from rce.tls import CertificateError, Context, explain_to_client
@@ -97,6 +98,7 @@ class ContentClient:
         secret: Proves that this is a task set of the same engine.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection; none for a plain one.
+        connections: Where connections are noted.
     """
 
     def __init__(
@@ -106,7 +108,9 @@ class ContentClient:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         *,
         tls: Context | None = None,
+        connections: OpenConnections | None = None,
     ) -> None:
+        self._connections = connections or OpenConnections()
         self._masters = masters
         self._secret = secret
         self._timeouts = timeouts
@@ -148,7 +152,8 @@ class ContentClient:
         )
         try:
             headers = {"Host": parts.netloc, "Authorization": f"Bearer {shown}", "Range": f"bytes={offset}-"}
-            reply = await exchange(reader, writer, path, headers, PIECE)
+            with self._connections.noting(writer.transport, url):
+                reply = await exchange(reader, writer, path, headers, PIECE)
             if reply.status == HTTPStatus.UNAUTHORIZED:
                 self._secret.was_refused(shown)  # the next attempt shows the other one, if there is one
             return reply

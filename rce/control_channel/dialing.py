@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from websockets.asyncio.client import connect
 
 from rce.control.execution import MAX_DATA, path_of
+from rce.control_channel.connections import OpenConnections
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_url_socket
 from rce.liveness.websocket import WatchedConnection
@@ -41,6 +42,7 @@ class Dialer:
         secret: Proves that this is a task set of the same engine.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
+        connections: Where connections are noted, except those whose silence is not limited.
     """
 
     def __init__(
@@ -50,7 +52,9 @@ class Dialer:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         *,
         tls: Context | None = None,
+        connections: OpenConnections | None = None,
     ) -> None:
+        self._connections = connections or OpenConnections()
         self._tls = tls
         self._masters = masters
         self._secret = secret
@@ -72,7 +76,8 @@ class Dialer:
             OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
             WebSocketException: It does not take the connection.
         """
-        url = self._masters.current.rstrip("/")
+        address = self._masters.current
+        url = address.rstrip("/")
         async with asyncio.timeout(self._timeouts.open):
             sock = await open_url_socket(url)
         async with connect(
@@ -90,7 +95,11 @@ class Dialer:
             max_queue=4,
             create_connection=TaskSetConnection,
         ) as master:
-            yield master
+            if silence is None:
+                yield master
+                return
+            with self._connections.noting(master.transport, address):
+                yield master
 
 
 class RunDialer(Dialer):

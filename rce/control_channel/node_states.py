@@ -60,11 +60,11 @@ class NodeStateClient:
             NodeStateError: The master is away, refuses it, or lacks it now.
         """
         try:
-            async with (
-                asyncio.timeout(ANSWER_S + most / MIN_RATE),
-                self._dialer.connect(PATH, PIECE) as master,
-            ):
+            async with asyncio.timeout(ANSWER_S) as limit, self._dialer.connect(PATH, PIECE) as master:
                 found = await _ask(master, question, Found)
+                limit.reschedule(
+                    asyncio.get_running_loop().time() + ANSWER_S + min(found.size, most) / MIN_RATE
+                )
                 return await _receive(master, found, most) if found.sha256 else None
         except (OSError, TimeoutError, WebSocketException, CertificateError) as error:
             raise NodeStateError(_explain(error)) from error
