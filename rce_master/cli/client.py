@@ -16,6 +16,7 @@ import typer
 from rce.masters import Masters
 from rce.tls import CertificateError, client_context, explain_to_client
 from rce.web.client import Sent, noting_sent, session_connector
+from rce.web.sending import StalledError, watched_body
 from rce_master.cli.attempts import NOT_NOW, Attempts
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
@@ -262,21 +263,29 @@ class ApiClient:
             ApiError: The master refused.
             CliError: The master could not be reached.
         """
-        timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=UPLOAD_S)
+        connect = CONNECT_S if self._masters.has_others else REQUEST_S
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=connect, sock_read=UPLOAD_S)
         headers = {"Content-Type": "application/gzip"}
         if self._masters.has_others:
             # A file is sent once; this finds a master that answers.
             await self.call("GET", "/user")
         try:
-            async with self._session.put(
-                self._base + path,
-                data=file,
-                params=query,
-                headers=headers,
-                timeout=timeout,
-                allow_redirects=False,
-            ) as reply:
+            async with (
+                watched_body(file, stall_s=REQUEST_S, answer_s=UPLOAD_S) as body,
+                self._session.put(
+                    self._base + path,
+                    data=body,
+                    params=query,
+                    headers=headers,
+                    timeout=timeout,
+                    allow_redirects=False,
+                ) as reply,
+            ):
                 return await _result(reply)
+        except StalledError as error:
+            raise CliError(
+                f"cannot use the master at {self._base}: {error}; it changed nothing; send the file again"
+            ) from error
         except (aiohttp.ClientError, TimeoutError, ValueError) as error:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
