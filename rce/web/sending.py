@@ -42,6 +42,7 @@ async def watched_body(
     """
     body = _Body(file)
     loop = asyncio.get_running_loop()
+    timer: asyncio.TimerHandle
     try:
         async with asyncio.timeout(None) as limit:
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from aiohttp import ClientError, hdrs
 
 from rce.packages import DEFAULT_LIMITS
-from rce_master.leadership.standby_client import ANSWER_S, StandbyError, failure
+from rce.web.sending import watched_body
+from rce_master.leadership.standby_client import ANSWER_S, MIN_RATE, StandbyError, failure
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from rce_master.packages.contents import ContentStore
     from rce_master.store.etcd.layout import OtherMaster
 
+STALL_S = 10.0
+"""How long a master that takes an archive may take none of it; it writes to its disk meanwhile."""
 SILENCE_S = 5.0
 """How long a master that gives an archive may be silent, before and within its answer."""
 REMOVAL_S = 3.0
@@ -67,11 +70,16 @@ class ArchiveClient:
             file = await asyncio.to_thread(path.open, "rb")
         except OSError as error:
             raise StandbyError(f"this master cannot read the archive: {error.strerror}") from error
-        with file:
-            async with self._client.ask(
-                master, hdrs.METH_PUT, f"{self._path}/{sha256}", size=size, data=file
-            ):
-                pass
+        url = f"{self._path}/{sha256}"
+        try:
+            with file:
+                async with (
+                    watched_body(file, stall_s=STALL_S, answer_s=ANSWER_S + size / MIN_RATE) as body,
+                    self._client.ask(master, hdrs.METH_PUT, url, size=size, data=body),
+                ):
+                    pass
+        except TimeoutError as error:
+            raise failure(master, error) from error
 
     async def fetch(self, master: OtherMaster, sha256: str, store: ContentStore) -> None:
         """Fetch an archive, and keep it after its hash was checked.

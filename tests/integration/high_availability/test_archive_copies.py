@@ -21,6 +21,7 @@ from support.ports import free_port
 from rce.aio.tasks import TaskScope, cancel_and_wait
 from rce.config import Secret
 from rce.control.snapshots import FileEntry, Manifest
+from rce_master.exceptions import StoreError
 from rce_master.http.archives import ArchiveRoutes
 from rce_master.http.leader_check import LeaderCheck
 from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
@@ -378,3 +379,23 @@ async def test_master_that_goes_silent_within_a_content_is_left(
                 with suppress(OSError):  # it is being fetched yet
                     await pair.copies.obtain(name)
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "why"), [(64 << 20, "it took nothing of the file for 1 s"), (1, "no answer in time")]
+)
+async def test_send_ends_when_a_master_takes_nothing(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, size: int, why: str
+) -> None:
+    """The limit for the whole archive, of more than a minute here, is that of a slow network."""
+    monkeypatch.setattr("rce_master.packages.transfer.STALL_S", 1.0, raising=False)
+    monkeypatch.setattr("rce_master.packages.transfer.ANSWER_S", 1.0)
+    pair.own.mkdir()
+    (large,) = hashes(1, "large")
+    with (pair.own / large).open("wb") as file:
+        file.truncate(size)
+    pair.gate.method = "PUT"
+    async with asyncio.timeout(40):
+        with pytest.raises(StoreError, match=f"other: {why}"):
+            async with pair.copies.spread(large):
+                pass
