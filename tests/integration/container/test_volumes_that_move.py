@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from support.containers import Machine, until
 from support.control_ends import SECRET
+from websockets.asyncio.server import ServerConnection, serve
 
 from rce.control.messages import (
     CONTROL_VERSION,
@@ -31,6 +32,7 @@ from rce.control.messages import (
 )
 from rce.control.model import VolumePlacement
 from rce.control.snapshots import Offer, decode_manifest, digest
+from rce.control_channel.connections import OpenConnections
 from rce.control_channel.contents import ContentClient, Piece
 from rce.control_channel.dialing import Dialer
 from rce.control_channel.peer import Peer
@@ -307,6 +309,37 @@ async def test_a_slow_snapshot_does_not_delay_other_users(
         assert {saved.volume for saved in a.of(VolumeSaved)} == {"other/journal"}
         await a.drop(BOX)
         await a.drop("other/box")
+
+
+async def test_volume_is_sent_to_the_next_leader_when_one_hangs(
+    pair: tuple[Machine, Machine], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next leader repeats its order, which changes nothing while the first one is carried out."""
+    monkeypatch.setattr("rce.control_channel.uploads.ANSWER_S", 3600.0)
+    a, _ = pair
+    asked, connections = asyncio.Event(), OpenConnections()
+
+    async def hang(socket: ServerConnection) -> None:
+        await socket.recv()
+        asked.set()
+        await socket.wait_closed()
+
+    async with keeping(folder, a), serve(hang, "127.0.0.1", 0, ping_interval=None) as hanging:
+        assert a.uploader is not None
+        leader = a.uploader._dialer._masters.current
+        former = f"ws://127.0.0.1:{hanging.sockets[0].getsockname()[1]}"
+        masters = Masters([former, leader])
+        a.uploader = Uploader(Dialer(masters, SECRET, connections=connections))
+        async with a.engine():
+            files(a).mkdir(parents=True)
+            order = SaveVolume(volume=JOURNAL, placement=0)
+            await a.manager.handle(order)
+            await asked.wait()
+            masters.failed(former)
+            connections.note_leader(leader)
+            await a.manager.handle(order)
+            await until(lambda: a.of(VolumeSaved), what="it is saved")
+        assert [saved.error for saved in a.of(VolumeSaved)] == [""]
 
 
 async def saved_by(machine: Machine) -> str:
