@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import gc
 import os
@@ -370,6 +371,13 @@ def _same_loops() -> Iterator[None]:
             each._used = before.get(each, each.numpy)
 
 
+_KEPT = ("/dev/", "anon_inode:", "/proc/")
+"""Beginnings of what may stay open: epoll of event loops, and what the interpreter opens once."""
+_NOT_KEPT = ("/dev/pts/", "/dev/ptmx", "anon_inode:[pidfd]", "anon_inode:inotify")
+_HANDLER = "RequestHandler."
+"""Beginning of the names of aiohttp's coroutines that handle requests."""
+
+
 def _descriptors() -> dict[int, str]:
     found = {}
     for entry in Path("/proc/self/fd").iterdir():
@@ -397,7 +405,7 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
         f"descriptor {fd} -> {target}"
         for fd, target in _descriptors().items()
         if fds.get(fd) != target
-        and not target.startswith(("/dev/", "anon_inode:", "/proc/"))
+        and (target.startswith(_NOT_KEPT) or not target.startswith(_KEPT))
         and "__pycache__" not in target
     ]
     found += [f"process {child.pid} {child.name()}" for child in _children() if child.pid not in children]
@@ -427,3 +435,30 @@ def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
             pytest.fail("left behind: " + "; ".join(leaks))
         gc.collect()
         time.sleep(0.05)
+
+
+def _tasks(loop: asyncio.AbstractEventLoop) -> list[asyncio.Task[object]]:
+    """Return the tasks of a loop, without aiohttp's handlers of requests whose clients left.
+
+    They end with what they send next, or ten seconds later if a body has not come.
+    """
+    tasks = asyncio.all_tasks(loop)
+    return [task for task in tasks if not getattr(task.get_coro(), "__qualname__", "").startswith(_HANDLER)]
+
+
+@pytest.fixture(autouse=True)
+def _no_tasks(request: pytest.FixtureRequest, _no_leaks: None) -> Iterator[None]:
+    """Fail an async test that leaves a task behind, which the end of its event loop would cancel.
+
+    Loops that the tests of a module share are left out, because what serves all of them runs there.
+    """
+    if "_function_scoped_runner" not in request.fixturenames:
+        yield
+        return
+    runner: asyncio.Runner = request.getfixturevalue("_function_scoped_runner")
+    yield
+    deadline = time.monotonic() + LEAK_TIMEOUT_S
+    while tasks := _tasks(runner.get_loop()):
+        if time.monotonic() > deadline:
+            pytest.fail("left behind: " + "; ".join(map(repr, tasks)))
+        runner.run(asyncio.sleep(0.005))
