@@ -83,6 +83,9 @@ class EventLog:
         capacity: How many events are kept.
         term: Of the leadership, if other masters may lead: event ids start at a number of their own for each
             term, since the clocks of machines differ. 0: there are no others.
+
+    Attributes:
+        is_closed: Whether followers are to end, because this master ends.
     """
 
     def __init__(self, start: float, capacity: int = CAPACITY, *, term: int = 0) -> None:
@@ -95,6 +98,7 @@ class EventLog:
         self._first_id = (_FIRST_TERM + term) * IDS_OF_TERM if term else int(start * 1000)
         self._next_id = self._first_id
         self._news = asyncio.Event()
+        self.is_closed = False
 
     @property
     def last_id(self) -> int:
@@ -155,8 +159,15 @@ class EventLog:
         self._news.set()
         self._news = asyncio.Event()
 
+    def close(self) -> None:
+        """Have all followers end, and those that come later."""
+        self.is_closed = True
+        self.wake()
+
     async def wait_change(self, timeout: float) -> None:
-        """Wait for an event or a call of :meth:`wake`, at most ``timeout`` seconds."""
+        """Wait for an event or a call of :meth:`wake`, at most ``timeout`` seconds; not once closed."""
+        if self.is_closed:
+            return
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await self._news.wait()

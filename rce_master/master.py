@@ -138,12 +138,15 @@ class Master:
         self,
         on_ready: Callable[[RunningMaster], None],
         before_listening: Callable[[], Awaitable[None]] | None = None,
+        hand_over: Callable[[], None] | None = None,
     ) -> None:
         """Run until cancelled.
 
         Args:
             on_ready: Called once everything listens.
             before_listening: Awaited after the state was loaded; frees the ports.
+            hand_over: Called at the end, when the requests of HTTP clients have been answered: lets another
+                master lead. What is left here is closed meanwhile, and acts no more.
 
         Raises:
             FencedError: This master leads no more.
@@ -223,9 +226,16 @@ class Master:
                         _tick(state_service, audit),
                     )
                 ]
+
+                def resign() -> None:
+                    if hand_over is not None:
+                        for worker in workers:
+                            worker.cancel()  # it would find that this master leads no more
+                        hand_over()
+
                 try:
                     contents = _TaskSetContents(keeper, snapshots, node_states)
-                    await self._serve(services, control_handler, contents, on_ready)
+                    await self._serve(services, control_handler, contents, on_ready, resign)
                 finally:
                     # Last: task sets that leave while the servers close still need the state service.
                     for worker in workers:
@@ -240,6 +250,7 @@ class Master:
         control_handler: ControlHandler,
         contents: _TaskSetContents,
         on_ready: Callable[[RunningMaster], None],
+        resign: Callable[[], None],
     ) -> None:
         settings = self._settings
         if settings.dev:
@@ -284,6 +295,8 @@ class Master:
             try:
                 with listening(settings.bind, settings.control_port, "--control-port"):
                     await stack.enter_async_context(control)
+                # After requests that can be finished, before task sets are waited for, which may be silent.
+                stack.callback(resign)
                 with listening(settings.bind, settings.http_port, "--http-port"):
                     await stack.enter_async_context(http)
             except OSError as error:

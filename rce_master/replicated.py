@@ -44,7 +44,7 @@ from rce_master.store.etcd.layout import prepare
 from rce_master.store.lock import FolderLock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from aiohttp import ClientSession
     from argon2 import PasswordHasher
@@ -216,9 +216,7 @@ class ReplicatedMaster:
                 async with asyncio.TaskGroup() as group:
                     works = (keeper.keep(), drains.run(), mark.run())
                     keeping = [group.create_task(work) for work in works]
-                    await master.run(on_ready, waiting.aclose)
-                    for task in keeping:
-                        task.cancel()
+                    await master.run(on_ready, waiting.aclose, partial(_hand_over, keeper, keeping))
             except* (FencedError, EtcdAwayError) as errors:
                 _log.warning("this master leads no more: %s", next(errors_in(errors)))
             finally:
@@ -263,6 +261,12 @@ def _tell_each_other(keeper: LeadershipKeeper, follower: StateFollower, forwarde
     keeper.on_save, keeper.on_look = follower.saw, forwarder.led_by
     keeper.is_watched = lambda: follower.is_watching
     follower.on_leadership = keeper.wake
+
+
+def _hand_over(keeper: LeadershipKeeper, keeping: Sequence[asyncio.Task[None]]) -> None:
+    for task in keeping:
+        task.cancel()  # without a lease, they would report that it is lost
+    keeper.resign()
 
 
 async def _prepare(client: EtcdClient, prefix: str) -> None:

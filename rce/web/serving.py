@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from rce.guard import Guest
 
-SHUTDOWN_S = 0.5
-"""How long open requests may continue when the server ends."""
+SHUTDOWN_S = 0.25
+"""How long open requests may continue when the server ends; the library waits so long, and once more."""
 _FIRST_ERROR = 400
 
 

@@ -82,6 +82,7 @@ async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnect
     """Pass frames on until either side disconnects or takes nothing, or the user loses the permission.
 
     Raises:
+        EndedError: This master ends.
         FencedError: This master leads no more.
         ValueError: The login has ended, or the user sends what is not a frame.
     """
@@ -111,6 +112,7 @@ async def _watch(call: Call) -> None:
     """Never return; raise when the login has ended.
 
     Raises:
+        EndedError: This master ends.
         ValueError: The login has ended.
     """
     while await call.lasts(CHECK_S):

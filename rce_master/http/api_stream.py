@@ -163,7 +163,7 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
         await call.write(response, b"id: %d\n: hello\n\n" % last + (b"" if gap is None else _frame(gap)))
         last = last if gap is None else gap.id
         written = clock()
-        while True:
+        while not events.is_closed:
             news = await events.wait(last, max(0.0, written + HEARTBEAT_S - clock()), scope)
             if not call.is_still_valid:
                 await call.write(response, _frame(_farewell(call, last)))
@@ -178,7 +178,8 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
                 await call.services.quotas.replay(call.caller)
     except (ConnectionError, FencedError):
         # The client disconnected, or another master leads and is asked next, from the last event on.
-        return response
+        pass
+    return response
 
 
 def _start(call: Call) -> int:

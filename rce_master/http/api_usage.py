@@ -8,7 +8,7 @@ from aiohttp import web
 from msgspec import json
 
 from rce.web.openapi import Query
-from rce_master.exceptions import FencedError, InvalidRequestError, TooMuchError
+from rce_master.exceptions import EndedError, FencedError, InvalidRequestError, TooMuchError
 from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of_users, whole
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 from rce_master.http.usage_models import ContainerUsageOut, UsageOut
@@ -67,8 +67,8 @@ async def _stream(call: Call, interval: int) -> web.StreamResponse:
                 await call.write(response, b": %s\n\n" % ENDED.encode())
                 return response
             await call.write(response, await _frame(call))
-    except (ConnectionError, FencedError):
-        # The client disconnected, or another master leads.
+    except (ConnectionError, EndedError, FencedError):
+        # The client disconnected, or another master leads or will.
         return response
 
 

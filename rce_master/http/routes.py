@@ -12,7 +12,13 @@ from rce.guard import TrustedProxies
 from rce.web import routes
 from rce.web.openapi import Query
 from rce.web.writing import write
-from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
+from rce_master.exceptions import (
+    EndedError,
+    ForbiddenError,
+    InvalidRequestError,
+    NotFoundError,
+    WrongCredentialsError,
+)
 from rce_master.http.forwarded import HEADER, ForwardingKey
 from rce_master.state.user_records import User, UserRole
 
@@ -155,10 +161,16 @@ class Call:
             self.services.fence.check()
 
     async def lasts(self, seconds: float) -> bool:
-        """Wait; return False as soon as the caller has lost the permission."""
+        """Wait; return False as soon as the caller has lost the permission.
+
+        Raises:
+            EndedError: This master ends.
+        """
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.is_still_valid:
+            if self.services.events.is_closed:
+                raise EndedError
             left = end - loop.time()
             if left <= 0:
                 return True

@@ -60,6 +60,7 @@ def make_app(
     fence = services.fence
     inner = [] if fence is None else [_fencing(fence), settling(services.state_service, fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
+    app.on_shutdown.append(_ending(services))
     app.router.add_get("/", _at_entry(entry))
     health = Health(services.state_service, services.fence, services.drains, services.warnings)
     app.router.add_get(HEALTH_PATH, health.handle)
@@ -93,6 +94,13 @@ def _metrics(services: Services) -> Handler:
         return await scraped()()
 
     return handle
+
+
+def _ending(services: Services) -> Callable[[web.Application], Awaitable[None]]:
+    async def end_streams(_: web.Application) -> None:
+        services.events.close()
+
+    return end_streams
 
 
 # Middleware of all routes

@@ -90,6 +90,11 @@ class LeaseSettings:
         return self.ttl / RENEWALS
 
     @property
+    def revocation(self) -> float:
+        """Time that one member of etcd has to end a lease before the next one is asked."""
+        return self.ttl / (2 * RENEWALS)
+
+    @property
     def poll(self) -> float:
         """Time from one look of a stand-by at the leader key to the next, without a watch of the key."""
         return min(POLL_S, self.ttl / (2 * RENEWALS))

@@ -34,6 +34,8 @@ def boot_time() -> float:
 class LeadershipKeeper:
     """The leadership of one master: :meth:`acquire`, then :meth:`keep`, then :meth:`step_down`, and again.
 
+    :meth:`resign` begins the last of them.
+
     Args:
         client: Connected to etcd.
         prefix: Of the state's keys.
@@ -79,6 +81,8 @@ class LeadershipKeeper:
         self.on_look: Callable[[int], None] = lambda _: None
         self.is_watched: Callable[[], bool] = lambda: False
         self._woken = asyncio.Event()
+        self._ending: asyncio.Task[None] | None = None
+        """Gives the lease back."""
 
     def wake(self) -> None:
         """Let a stand-by look at etcd now: the leadership has changed, or is not watched any more."""
@@ -191,10 +195,21 @@ class LeadershipKeeper:
             self.core.lost()
         return True
 
-    async def step_down(self) -> None:
-        """End the lease, so that another master leads at once; nothing of the term may be left."""
+    def resign(self) -> None:
+        """Begin to hand over: the fence is closed, and the lease ends, so that another master leads at once.
+
+        What is left of the term may be let go of meanwhile. Nothing happens a second time.
+        """
         self.core.resigned()
-        await self._revoke()
+        if self._ending is None:
+            self._ending = asyncio.create_task(self._revoke(), name="give the lease back")
+
+    async def step_down(self) -> None:
+        """End the lease, if that has not begun, and become a stand-by; nothing of the term may be left."""
+        self.resign()
+        assert self._ending is not None
+        await self._ending
+        self._ending = None
         self.core.released()
         self._store = None
 
@@ -203,7 +218,7 @@ class LeadershipKeeper:
         if not lease:
             return
         try:
-            await self._client.revoke(lease)
+            await self._client.revoke(lease, timeout=self.core.settings.revocation)
         except StoreError as error:
             _log.info("the lease is left to end by itself: %s", error)
 

@@ -330,14 +330,18 @@ class EtcdClient:
         """
         return (await self._call("v3/lease/keepalive", wire.lease_request(lease), wire.read_lease))[1]
 
-    async def revoke(self, lease: int) -> None:
+    async def revoke(self, lease: int, timeout: float | None = None) -> None:
         """End a lease, and with it its keys.
+
+        Args:
+            lease: Its number.
+            timeout: Seconds that one member may take; None: as long as for any small request.
 
         Raises:
             EtcdRefusedError: etcd refused; the code ``NOT_FOUND`` says that the lease has ended.
             EtcdAwayError: No member answered.
         """
-        await self._call("v3/lease/revoke", wire.lease_request(lease), wire.as_it_is)
+        await self._call("v3/lease/revoke", wire.lease_request(lease), wire.as_it_is, timeout)
 
     async def faults(self) -> tuple[str, ...]:
         """Return the faults of the cluster that the member in use knows; it asks no other member.

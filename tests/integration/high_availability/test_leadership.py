@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from urllib.parse import urlsplit
 
 import pytest
+from support.absent_masters import silent_master
 from support.engine import until
 from support.etcd import Cluster
 
@@ -13,6 +15,7 @@ from rce_master.leadership import LeaseSettings, Role
 from rce_master.leadership.keeper import LeadershipKeeper, boot_time
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient
+from rce_master.store.etcd.store import EtcdStore
 
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
@@ -38,6 +41,19 @@ async def test_one_keeper_leads_and_hands_over_at_once(client: EtcdClient) -> No
     with pytest.raises(FencedError):
         await store.save([Row("users", "a", b"2")], fence.term)
     await second.step_down()
+
+
+async def test_silent_member_delays_the_end_of_a_lease_little(client: EtcdClient, etcd: Cluster) -> None:
+    async with silent_master() as (url, asked):
+        members = [urlsplit(url).netloc, *etcd.endpoints]
+        async with EtcdClient(members, attempt=3600.0) as other:
+            keeper = LeadershipKeeper(client, PREFIX, "one", PATIENT)
+            await keeper.acquire()
+            keeper._client = other
+            async with asyncio.timeout(120):
+                await keeper.step_down()
+            assert asked.is_set()
+            assert (await EtcdStore(client, PREFIX).leadership()).leader is None
 
 
 async def test_of_many_keepers_one_leads(client: EtcdClient) -> None:
