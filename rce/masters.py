@@ -90,6 +90,11 @@ class Masters:
         """Whether another address has not failed since a master worked: a slow one need not be waited for."""
         return self._failures + 1 < len(self.all)
 
+    @property
+    def is_round_over(self) -> bool:
+        """Whether all addresses failed equally often since a master worked: then a pause is due."""
+        return self._failures % len(self.all) == 0
+
     def failed(self, address: str) -> None:
         """Switch to the next address, if ``address`` is still in use."""
         if address == self.current:

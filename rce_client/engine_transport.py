@@ -205,6 +205,7 @@ class EngineTransport:
         pauses = self._timing.backoff.start()
         while True:
             self._listener.on_connecting()
+            url = self._masters.current
             try:
                 socket = await self._dial()
             except Exception as raised:
@@ -213,6 +214,8 @@ class EngineTransport:
                 repairable = self._was_connected and isinstance(error, UntrustedError)
                 if isinstance(error, RefusedError) and not repairable:
                     raise error from raised
+                if self._masters.current != url and not self._masters.is_round_over:
+                    continue  # a pause for each round is enough: another master may lead
                 delay = pauses.next()
                 await asyncio.sleep(min(delay, IN_USE_DELAY) if isinstance(error, InUseError) else delay)
                 continue

@@ -267,13 +267,15 @@ class TaskSetChannel:
         """Run one connection to its end, and choose the next master; return how long to wait, in seconds."""
         self._url = self._masters.current
         self._worked = False
-        delay = await self._connect()
+        least = await self._connect()
         if not self._worked:
             self._masters.failed(self._url)
-        return delay
+        if least or not self._masters.is_round_over:
+            return least
+        return self._pauses.next()
 
     async def _connect(self) -> float:
-        """Run one connection to its end; return how long to wait before the next, in seconds."""
+        """Run one connection to its end; return how long to wait at least before the next, in seconds."""
         shown = self._secret.reveal()
         try:
             timeouts = self._timeouts
@@ -305,7 +307,7 @@ class TaskSetChannel:
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
                 if self._secret.was_refused(shown):
                     _log.info("the master at %s refuses one of our secrets; showing the other", self._url)
-                    return self._pauses.next()
+                    return 0.0
                 _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
                 return self._timeouts.backoff_refused
             body = bytes(error.response.body or b"")[:_MOST_SAID].decode(errors="replace").strip()
@@ -320,7 +322,7 @@ class TaskSetChannel:
         if self._handler_failed:  # it may fail again, so not at once
             self._handler_failed = False
             return self._timeouts.backoff_refused
-        return self._pauses.next()
+        return 0.0
 
     def _tell(self, error: Exception) -> None:
         """Log why the connection failed: as a warning at first, and whenever the reason changes."""

@@ -37,6 +37,22 @@ async def silent_master() -> AsyncIterator[tuple[str, asyncio.Event]]:
         server.close()
 
 
+@contextlib.asynccontextmanager
+async def counted_standby(scheme: str = "ws") -> AsyncIterator[tuple[str, list[int]]]:
+    """Give the address of what closes each connection at once, and the numbers of those that came."""
+    dialed: list[int] = []
+
+    async def close(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        dialed.append(len(dialed))
+        writer.transport.abort()
+
+    server = await asyncio.start_server(close, "127.0.0.1", 0)
+    try:
+        yield f"{scheme}://127.0.0.1:{server.sockets[0].getsockname()[1]}", dialed
+    finally:
+        server.close()
+
+
 @contextlib.contextmanager
 def unreachable_port() -> Iterator[int]:
     """Give a port of this machine to which no connection can be made, nor is one refused.

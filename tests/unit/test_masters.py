@@ -51,6 +51,21 @@ def test_others_are_untried_until_each_failed() -> None:
     assert not alone.has_others
 
 
+def test_a_round_is_over_when_each_failed_once_more() -> None:
+    masters = Masters(["a", "b", "c"])
+    seen = [masters.is_round_over]
+    for _ in range(6):
+        masters.failed(masters.current)
+        seen.append(masters.is_round_over)
+    assert seen == [True, False, False, True, False, False, True]
+    masters.failed(masters.current)
+    masters.worked()
+    assert masters.is_round_over
+    alone = Masters("a")
+    alone.failed("a")
+    assert alone.is_round_over
+
+
 @pytest.mark.parametrize("nothing", ["", " , ", ()])
 def test_no_address_is_refused(nothing: str | tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="give the address of a master"):

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 from integration.client.conftest import TIMING, Engine
-from support.absent_masters import silent_master, unreachable_port
+from support.absent_masters import counted_standby, silent_master, unreachable_port
 from support.client_types import ECHO, STRING, ros_string
 from support.cloud import PASSWORD, content_of, running_cloud
+from support.engine import until
 from support.slow_link import SlowLink
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import cancel_and_wait
 from rce.model import ConfigureComponents, ConfigureConnections
 from rce.model import Connection as ConnectionSpec
 from rce.protocol import MAX_ITEMS
@@ -493,3 +495,17 @@ async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine)
         async with asyncio.timeout(30), connection:
             assert connection.connected
         await engine.cloud.master.changed.until(lambda: not engine.cloud.master.inside)
+
+
+async def test_masters_are_asked_with_one_pause_for_each_round(engine: Engine) -> None:
+    timing = replace(TIMING, backoff=Backoff(first=600.0, longest=600.0))
+    async with counted_standby("http") as (one, ones), counted_standby("http") as (two, twos):
+        absent = Connection([one, two], "testUser", PASSWORD, "testRobot", timing=timing)
+        waiting = asyncio.create_task(absent.__aenter__())
+        await until(lambda: twos, what="all were asked")
+        await asyncio.sleep(0.3)
+        await cancel_and_wait(waiting)
+        assert (len(ones), len(twos)) == (1, 1)
+        masters = [one, two, engine.door.url]
+        async with asyncio.timeout(30), Connection(masters, "testUser", PASSWORD, "testRobot", timing=timing):
+            pass

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
 from dataclasses import replace
 
 import pytest
 from msgspec import structs
-from support.absent_masters import unreachable_port
+from support.absent_masters import counted_standby, unreachable_port
 from support.control_ends import QUICK, SECRET, Master, TaskSet, headers, hello
+from support.engine import until
 from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 
+from rce.aio.backoff import Backoff
 from rce.control.exceptions import (
     MasterUnavailableError,
     PeerGoneError,
@@ -190,20 +191,25 @@ async def test_of_several_masters_the_next_is_dialed_when_one_is_away() -> None:
             await second.hellos.get()
 
 
-@contextlib.asynccontextmanager
-async def counted_standby() -> AsyncIterator[tuple[str, list[int]]]:
-    """Give the address of what closes each connection at once, and the numbers of those that came."""
-    dialed: list[int] = []
-
-    async def close(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        dialed.append(len(dialed))
-        writer.transport.abort()
-
-    server = await asyncio.start_server(close, "127.0.0.1", 0)
-    try:
-        yield f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}", dialed
-    finally:
-        server.close()
+@pytest.mark.parametrize("is_there", [True, False])
+async def test_masters_are_dialed_with_one_pause_for_each_round(is_there: bool) -> None:
+    timeouts = replace(QUICK, backoff=Backoff(first=600.0, longest=600.0))
+    master = Master()
+    async with contextlib.AsyncExitStack() as stack:
+        standbys = [await stack.enter_async_context(counted_standby()) for _ in range(3)]
+        urls = [url for url, _ in standbys]
+        if is_there:
+            await stack.enter_async_context(master.server)
+            urls[2] = f"ws://127.0.0.1:{master.server.port}"
+        robots = TaskSet(0)
+        robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=timeouts)
+        async with robots.running(), asyncio.timeout(30):
+            if is_there:
+                await master.hellos.get()
+            else:
+                await until(lambda: standbys[2][1], what="all were dialed")
+            await asyncio.sleep(0.3)
+        assert [len(dialed) for _, dialed in standbys] == [1, 1, 1 - is_there]
 
 
 async def test_the_master_that_worked_is_dialed_first_again() -> None:
