@@ -103,7 +103,8 @@ class ControlServer:
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
         on_upload: The same for a connection to send a snapshot (:mod:`rce.control.snapshots`).
-        is_fenced: Tells that another master may lead by now. Then nothing is sent to task sets any more.
+        is_fenced: Tells that another master may lead by now. Then nothing is sent to task sets any more,
+            nor taken from them: they are dismissed, to dial the next one.
         term: The term of leadership in which this master talks; 0: there are no other masters.
     """
 
@@ -219,12 +220,20 @@ class ControlServer:
                     await socket.close(_POLICY, "this task set's certificate was revoked")
 
     async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:
-        refusal = self._authenticate(socket, request)
-        if refusal is None and self._is_fenced is not None and self._is_fenced():
-            return socket.respond(HTTPStatus.SERVICE_UNAVAILABLE, "This master leads no more.\n")
+        refusal = self._authenticate(socket, request) or self._refuse_fenced(socket)
         if refusal is None and self._contents is not None and is_for_contents(request.path):
-            return await answer(request, self._contents)
+            piece = await answer(request, self._contents)
+            return self._refuse_fenced(socket) or piece  # the lead may be lost while it is read
         return refusal
+
+    def _refuse_fenced(self, socket: ServerConnection) -> Response | None:
+        if not self._leads_no_more:
+            return None
+        return socket.respond(HTTPStatus.SERVICE_UNAVAILABLE, "This master leads no more.\n")
+
+    @property
+    def _leads_no_more(self) -> bool:
+        return self._is_fenced is not None and self._is_fenced()
 
     def _authenticate(self, socket: ServerConnection, request: Request) -> Response | None:
         given = request.headers.get_all("Authorization")
@@ -291,8 +300,15 @@ class ControlServer:
 
     async def _refuse(self, socket: ServerConnection, reason: str) -> None:
         _log.warning("refused a task set at %s: %s", socket.remote_address, reason)
+        if self._leads_no_more:  # another one may take it at once
+            await self._dismiss(socket)
+            return
         await socket.send(encode(Refused(reason=reason)))
         await socket.close(_POLICY, _clip(reason))
+
+    async def _dismiss(self, socket: ServerConnection) -> None:
+        """Have a task set dial the next master."""
+        await socket.close(_GOING_AWAY, "this master leads no more")
 
     async def _serve_peer(self, peer: Peer, socket: ServerConnection) -> None:
         while (older := self._peers.get(peer.process)) is not None:
@@ -318,6 +334,9 @@ class ControlServer:
             await self._refuse(socket, error.reason)
             return
         except Exception:  # noqa: BLE001 - one peer must not end the server
+            if self._leads_no_more:
+                await self._dismiss(socket)
+                return
             _log.exception("taking %r failed", peer)
             await socket.close(_INTERNAL, "the master failed")
             return
@@ -341,6 +360,9 @@ class ControlServer:
 
     async def _read(self, peer: Peer, socket: ServerConnection) -> None:
         while (message := await self._receive(socket)) is not None:
+            if self._leads_no_more:
+                await self._dismiss(socket)
+                return
             match message:
                 case LogChunk() | StateSaved():
                     peer.answer(message)

@@ -9,9 +9,11 @@ from support.control_ends import QUICK, SECRET, Master, TaskSet, headers, hello
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import CloseCode
 from websockets.typing import Origin
 
 from rce.config.secret import Secret
+from rce.control import ContentError
 from rce.control.messages import (
     CONTROL_VERSION,
     Left,
@@ -21,6 +23,9 @@ from rce.control.messages import (
     encode,
 )
 from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.contents import ContentClient
+from rce.control_channel.server import ControlServer
+from rce.masters import Masters
 
 
 async def test_wrong_secret_is_refused_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:
@@ -164,3 +169,47 @@ async def test_refusal_is_logged_and_tried_again(caplog: pytest.LogCaptureFixtur
         master.refuse = ""
         await robots.channel.wait_connected()
         assert master.story == ["hello"]
+
+
+async def test_a_fenced_master_takes_no_message() -> None:
+    is_fenced = False
+    master = Master()
+    master.server._is_fenced = lambda: is_fenced
+    async with master.server, asyncio.timeout(30):
+        url = f"ws://127.0.0.1:{master.server.port}"
+        async with connect(url, additional_headers=headers(), proxy=None) as task_set:
+            await task_set.send(encode(hello()))
+            for _ in ("Welcome", "Sync"):
+                await task_set.recv()
+            is_fenced = True
+            await task_set.send(encode(Left(id="u/r", reason="bye")))
+            await task_set.wait_closed()
+            assert task_set.close_code == CloseCode.GOING_AWAY
+        await master.gone.get()
+        assert master.messages.empty()
+
+
+async def test_a_content_is_not_given_once_the_lead_is_lost() -> None:
+    is_fenced = False
+
+    async def ignore(*_: object) -> None:
+        return None
+
+    async def read(_: str, __: int, ___: int) -> tuple[bytes, int]:
+        nonlocal is_fenced
+        is_fenced = True
+        return b"old", 3
+
+    server = ControlServer(
+        SECRET,
+        on_hello=ignore,
+        on_message=ignore,
+        on_gone=ignore,
+        port=0,
+        contents=read,
+        is_fenced=lambda: is_fenced,
+    )
+    async with server:
+        client = ContentClient(Masters(f"ws://127.0.0.1:{server.port}"), SECRET)
+        with pytest.raises(ContentError, match="leads no more"):
+            await client.piece("0" * 64, 0)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 
 from rce.config.settings import LOOPBACK
 from rce.control import decode_to_task_set, encode
@@ -127,3 +128,19 @@ async def test_task_sets_hear_nothing_after_the_lead_is_lost(run_site: RunSite, 
             await task_set.send(encode(question))
             with pytest.raises(ConnectionClosed):
                 await task_set.recv()
+
+
+async def test_a_task_set_of_a_newer_term_dials_the_next_master(run_site: RunSite, lead: Lead) -> None:
+    """It is not refused: it would wait before it dials the master that leads now."""
+    machine = MachineInfo(name="machine", cores=2)
+    hello = Hello(version=CONTROL_VERSION, kind=TaskSetKind.CONTAINER, process="c1", machine=machine, term=1)
+    async with run_site(fence=lead.fence) as site, asyncio.timeout(60):
+        headers = {"Authorization": "Bearer a secret for the tests"}
+        url = f"ws://{LOOPBACK}:{site.master.control_port}/"
+        async with connect(url, additional_headers=headers) as task_set:
+            await task_set.send(encode(hello))
+            with pytest.raises(ConnectionClosed) as closed:
+                await task_set.recv()
+        assert lead.fence.is_closed
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == CloseCode.GOING_AWAY
