@@ -14,6 +14,9 @@ from rce.lookups import LOOKUPS
 if TYPE_CHECKING:
     import ssl
 
+UPLOAD_S = 300.0
+"""Seconds to wait for an answer to an upload, which the server checks and copies first."""
+
 
 class NameResolver(AbstractResolver):
     """Looks host names up without delaying the program's end (:mod:`rce.lookups`)."""

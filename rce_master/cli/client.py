@@ -15,7 +15,7 @@ import typer
 
 from rce.masters import Masters
 from rce.tls import CertificateError, client_context, explain_to_client
-from rce.web.client import Sent, noting_sent, session_connector
+from rce.web.client import UPLOAD_S, Sent, noting_sent, session_connector
 from rce.web.sending import StalledError, watched_body
 from rce_master.cli.attempts import NOT_NOW, Attempts
 from rce_master.cli.exceptions import ApiError, CliError
@@ -40,8 +40,6 @@ ANSWER_S = 5.0
 """How long one of several masters may be silent before another one is asked that was not asked yet."""
 STREAM_S = 35.0
 """How long a stream of events may be silent; a master writes to it every 15 s."""
-UPLOAD_S = 300.0
-"""Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
 IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000

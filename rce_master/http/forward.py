@@ -13,7 +13,7 @@ from aiohttp import hdrs, web
 from multidict import CIMultiDict
 from yarl import URL
 
-from rce.web.client import Sent, noting_sent
+from rce.web.client import UPLOAD_S, Sent, noting_sent
 from rce.web.origin import is_foreign
 from rce.web.writing import write
 from rce_master.http.forwarded import HEADER
@@ -34,7 +34,8 @@ _log = logging.getLogger(__name__)
 
 CONNECT_S = 2.0
 SILENCE_S = 60.0
-"""A leader that says nothing for so long in an answer is given up; streams say something more often."""
+"""A leader that says nothing for so long in an answer is given up; streams say something more often. One that
+gets an upload has as long as clients wait."""
 _OF_CONNECTION = frozenset(
     name.lower()
     for name in (
@@ -97,11 +98,9 @@ class Forwarder:
         self._session: aiohttp.ClientSession
 
     async def __aenter__(self) -> Self:
-        timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=SILENCE_S)
         self._session = aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(limit=0),
             cookie_jar=aiohttp.DummyCookieJar(),
-            timeout=timeout,
             auto_decompress=False,
             skip_auto_headers=_ADDED,
             trust_env=False,
@@ -159,6 +158,7 @@ class Forwarder:
                     headers=self._headers(request, leader),
                     data=request.content if request.body_exists else None,
                     allow_redirects=False,
+                    timeout=_timeout(request),
                     ssl=self._tls() if self._tls is not None else True,
                     trace_request_ctx=sent,
                 ) as reply,
@@ -210,6 +210,13 @@ class Forwarder:
         address = self._proxies.origin(peer, request.headers.getall("X-Forwarded-For", ()))
         headers[HEADER] = self._key.sign(address, leader.term)
         return headers
+
+
+def _timeout(request: web.Request) -> aiohttp.ClientTimeout:
+    is_upload = request.body_exists and request.content_type != "application/json"
+    return aiohttp.ClientTimeout(
+        total=None, sock_connect=CONNECT_S, sock_read=UPLOAD_S if is_upload else SILENCE_S
+    )
 
 
 def _without(headers: CIMultiDictProxy[str]) -> CIMultiDict[str]:

@@ -17,6 +17,7 @@ from rce.config import Secret
 from rce.guard import TrustedProxies
 from rce_master.cli.client import IDEMPOTENCY_KEY, ApiClient
 from rce_master.cli.exceptions import ApiError, CliError
+from rce_master.http import forward as forwarding
 from rce_master.http.forward import Forwarder, NotForwardedError
 from rce_master.http.forwarded import ForwardingKey
 from rce_master.store.etcd.layout import Leader
@@ -114,6 +115,34 @@ async def test_no_stand_by_denies_what_it_did_as_leader(method: str, status: int
     ):
         assert reply.status == status
         assert ("RCE-Standby" in reply.headers) == (method == "GET")
+
+
+@pytest.mark.parametrize(("media", "status"), [("application/gzip", 200), ("application/json", 502)])
+async def test_a_leader_has_longer_to_answer_an_upload(
+    monkeypatch: pytest.MonkeyPatch, media: str, status: int
+) -> None:
+    """It looks at an archive, and copies it to other masters, before it answers."""
+    monkeypatch.setattr(forwarding, "SILENCE_S", 0.2)
+
+    async def answer(request: web.Request) -> web.Response:
+        await request.read()
+        await asyncio.sleep(2.0)
+        return web.Response()
+
+    async def pass_on(request: web.Request) -> web.StreamResponse:
+        return await forwarder.forward(request, Leader("first", 1, str(leader.make_url("/"))))
+
+    masters = [web.Application() for _ in range(2)]
+    masters[0].router.add_route("*", "/a", answer)
+    masters[1].router.add_route("*", "/a", pass_on)
+    async with (
+        TestServer(masters[0]) as leader,
+        TestServer(masters[1]) as standby,
+        Forwarder(FORWARDING, TrustedProxies()) as forwarder,
+        aiohttp.ClientSession() as session,
+        session.put(standby.make_url("/a"), data=b"{}", headers={"Content-Type": media}) as reply,
+    ):
+        assert reply.status == status
 
 
 @pytest.mark.parametrize(("method", "status"), [("POST", 502), ("GET", 503)])
