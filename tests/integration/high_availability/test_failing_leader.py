@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from rce_master.audit import AuditLog
 from rce_master.master import RunningMaster
 from rce_master.replicated import ReplicatedMaster
 from rce_master.settings import MasterSettings
+from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.store import EtcdStore
 
@@ -36,6 +37,9 @@ LEASE_S = 120.0
 SHUTDOWN_S = 10.0
 CLOSE_S = 90.0
 """How long a task set may take to leave; longer than this module waits for the end of a lease."""
+
+
+CONTAINER = "testUser/c"
 
 
 class BugError(Exception):
@@ -108,7 +112,9 @@ async def test_ending_leader_waits_for_no_stream_or_task_set(
     """The lease ends while a silent task set has yet to leave; a stream ends by itself."""
     monkeypatch.setattr(serving, "SHUTDOWN_S", SHUTDOWN_S)
     patient = replace(DEFAULT_TIMEOUTS, close=CLOSE_S)
-    monkeypatch.setitem(ControlServer.__init__.__kwdefaults__, "timeouts", patient)
+    defaults = ControlServer.__init__.__kwdefaults__
+    assert defaults is not None
+    monkeypatch.setitem(defaults, "timeouts", patient)
     async with AsyncExitStack() as stack:
         master = await stack.enter_async_context(leader(tmp_path))
         session = await stack.enter_async_context(aiohttp.ClientSession())
@@ -135,3 +141,34 @@ async def test_ending_leader_waits_for_no_stream_or_task_set(
         silent.transport.abort()
         with pytest.raises(asyncio.CancelledError):
             await master.running
+
+
+async def test_ending_leader_first_finishes_requests_under_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving, "SHUTDOWN_S", SHUTDOWN_S)
+    saving, may_save = asyncio.Event(), asyncio.Event()
+    save = EtcdStore.save
+
+    async def save_late(store: EtcdStore, rows: Sequence[Row], term: int) -> None:
+        if any(row.key == CONTAINER for row in rows):
+            saving.set()
+            await may_save.wait()
+        await save(store, rows, term)
+
+    async with leader(tmp_path) as master, aiohttp.ClientSession() as session:
+        site = Site(master.ready, session)
+        site.token = await site.login()
+        monkeypatch.setattr(EtcdStore, "save", save_late)
+        asking = asyncio.create_task(site.api("POST", "/containers", {"tag": "c"}, status=204))
+        async with asyncio.timeout(60):
+            await saving.wait()
+        master.running.cancel()
+        await asyncio.sleep(0.2)
+        assert await master.name() == "one"
+        may_save.set()
+        await asking
+        with pytest.raises(asyncio.CancelledError):
+            await master.running
+        assert await master.name() is None
+        assert any(CONTAINER in rows for rows in (await master.store.load()).values())
