@@ -8,6 +8,7 @@ import secrets
 import shutil
 import sys
 import tempfile
+import traceback
 from pathlib import Path
 
 from faults.catalogue import SCENARIOS, Scenario
@@ -33,9 +34,10 @@ def main() -> int:
         folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
         try:
             asyncio.run(_run(scenario, folder, options.seed, times, float(options.rounds)))
-        except AssertionError as error:
+        except Exception as error:  # noqa: BLE001 - the other scenarios run, and the table is printed
             failed.append(scenario.name)
-            print(f"{error}\nlogs: {folder}", flush=True)
+            said = isinstance(error, AssertionError)
+            print(error if said else traceback.format_exc(), f"logs: {folder}", sep="\n", flush=True)
         else:
             if options.keep:
                 print(f"logs: {folder}", flush=True)
