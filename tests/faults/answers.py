@@ -10,6 +10,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 
 from faults.machines import Machine
+from faults.seeds import generator
 from rce.config.store_address import ETCD_PORT
 
 _PIECE = 1 << 16
@@ -61,13 +62,13 @@ class LosingProxy:
 
 @asynccontextmanager
 async def losing_proxies(
-    machines: Sequence[Machine], host: str, rng: random.Random
+    machines: Sequence[Machine], host: str, seed: int
 ) -> AsyncIterator[dict[LosingProxy, str]]:
-    """Give a proxy for the member of each machine, with its address."""
+    """Give a proxy for the member of each machine, with its address; a seed chooses what they lose."""
     proxies: dict[LosingProxy, str] = {}
     async with AsyncExitStack() as stack:
         for machine in machines:
-            proxy = LosingProxy(machine.address, rng)
+            proxy = LosingProxy(machine.address, generator(seed, f"answers to {machine.name}"))
             server = await stack.enter_async_context(await asyncio.start_server(proxy.serve, host, 0))
             proxies[proxy] = f"{host}:{server.sockets[0].getsockname()[1]}"
         yield proxies

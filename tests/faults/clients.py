@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import random
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -17,6 +16,7 @@ from support.engine import until
 
 from faults.history import Expected, Fate, History
 from faults.machines import PATIENCE_S, Cluster
+from faults.seeds import generator
 from rce_master.leadership.core import STANDBY_HEADER
 
 USER = "testUser"
@@ -43,14 +43,14 @@ class Clients:
     Args:
         cluster: The masters.
         history: Takes what happens.
-        rng: Chooses what they do.
+        seed: Of what they choose.
     """
 
-    def __init__(self, cluster: Cluster, history: History, rng: random.Random) -> None:
+    def __init__(self, cluster: Cluster, history: History, seed: int) -> None:
         self._urls = [machine.url for machine in cluster.machines]
         self._cluster = cluster
         self._history = history
-        self._rng = rng
+        self._seed = seed
         self._token = ""
         self._numbers = itertools.count(1)
         self._tasks: list[asyncio.Task[None]] = []
@@ -203,9 +203,10 @@ class Clients:
         return fate in (Fate.DONE, Fate.MISSING)
 
     async def _write(self, user: str, used: int) -> None:
+        rng = generator(self._seed, user)
         async with self.session() as session:
             while True:
-                kind, value, start = self._rng.choice(KINDS), next(self._numbers), time.monotonic()
+                kind, value, start = rng.choice(KINDS), next(self._numbers), time.monotonic()
                 url, fate = f"{self._url(used)}api/v1/users/{user}/limits", Fate.UNKNOWN
                 try:
                     fate, _ = await self._ask(session, "PATCH", url, {kind: value})

@@ -17,6 +17,7 @@ from faults.clients import INITIAL, REGISTERS, Clients
 from faults.goals import Times
 from faults.history import Expected, History
 from faults.machines import PATIENCE_S, Cluster, Machine, cluster
+from faults.seeds import generator
 from faults.task_sets import ANSWER, Prober, Robot, running_containers, task_sets, watched_containers
 
 TASK_SETS = 2
@@ -28,6 +29,8 @@ class World:
     """What a scenario works with.
 
     Attributes:
+        seed: Of all choices.
+        rng: The scenario's own choices.
         scale: 1: as long as in a test run; more: the long run.
         robot: The robot whose links must not be interrupted; None: there are no task sets.
         misplaced: What the container task set does at the end that it should not, or does not do.
@@ -37,10 +40,14 @@ class World:
     clients: Clients
     history: History
     times: Times
-    rng: random.Random
+    seed: int
     scale: float = 1.0
     robot: Robot | None = None
     misplaced: list[str] = field(default_factory=list)
+    rng: random.Random = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rng = generator(self.seed, "scenario")
 
     async def until_written(self, what: str, since: float) -> float:
         """Note how long it took until a write was acknowledged that was asked for after a fault."""
@@ -159,13 +166,13 @@ async def world(
         AssertionError: Something was lost, done twice or by a master that led no more, or a link was cut; or
             too little was seen to tell.
     """
-    rng, history = random.Random(seed), History()
+    history = History()
     async with AsyncExitStack() as stack:
         machines = await stack.enter_async_context(cluster(folder))
         await machines.start()
-        clients = Clients(machines, history, rng)
+        clients = Clients(machines, history, seed)
         await clients.prepare()
-        made = World(machines, clients, history, times, rng, scale)
+        made = World(machines, clients, history, times, seed, scale)
         async with AsyncExitStack() as running:
             if robot:
                 made.robot = await running.enter_async_context(task_sets(machines, history))

@@ -145,7 +145,7 @@ async def _delayed(world: World, machine: Machine) -> AsyncIterator[None]:
 async def lose_answers(world: World) -> None:
     """Lose answers of etcd, with their connections: saves are done, and the masters are not told of it."""
     cluster = world.cluster
-    async with losing_proxies(cluster.machines, cluster.client.address, world.rng) as proxies:
+    async with losing_proxies(cluster.machines, cluster.client.address, world.seed) as proxies:
         await _restart(world, f"etcd://{','.join(proxies.values())}")
         for proxy in proxies:
             proxy.share = LOST_SHARE

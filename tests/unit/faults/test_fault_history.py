@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-import random
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Self, cast
@@ -249,7 +248,7 @@ class Session:
 )
 async def test_a_container_that_is_not_found_was_lost(before: Expected, status: int, lost: list[str]) -> None:
     history = History(containers={"a": before})
-    clients = Clients(cast("Any", SimpleNamespace(machines=[])), history, random.Random(1))
+    clients = Clients(cast("Any", SimpleNamespace(machines=[])), history, 1)
     assert await clients._change(cast("Any", Session(status)), "a", "DELETE", "http://m1/")
     assert history.containers == {"a": Expected.GONE}
     assert history.lost_containers == lost

@@ -1,0 +1,98 @@
+"""Runs of the fault suite: their choices, and what ends a scenario."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import sys
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from faults import __main__ as runs
+from faults import clients
+from faults.answers import losing_proxies
+from faults.catalogue import Scenario
+from faults.clients import REGISTER_USERS, Clients
+from faults.goals import Times
+from faults.history import Fate, History
+from faults.world import World
+
+SEED = 7
+CHOICES = 20
+
+
+def made_world(writers: Clients | None = None) -> World:
+    return World(cast("Any", None), cast("Any", writers), History(), Times(), SEED)
+
+
+async def written(user: str, monkeypatch: pytest.MonkeyPatch, *, before: int = 0) -> tuple[list[str], World]:
+    """Return what a writer chooses, and its world, after another one has made so many choices."""
+    writers = Clients(cast("Any", SimpleNamespace(machines=[SimpleNamespace(url="")])), History(), SEED)
+    world = made_world(writers)
+    kinds: list[str] = []
+
+    async def ask(*request: Any) -> tuple[Fate, dict[str, Any]]:
+        kinds.extend(request[-1])
+        await asyncio.sleep(0)
+        return Fate.DONE, {}
+
+    monkeypatch.setattr(writers, "_ask", ask)
+    monkeypatch.setattr(clients, "PAUSE_S", 0.0)
+    for name, count in ((REGISTER_USERS[0], before), (user, CHOICES)):
+        kinds.clear()
+        writing = asyncio.create_task(writers._write(name, 0))
+        while len(kinds) < count:
+            await asyncio.sleep(0)
+        writing.cancel()
+        await asyncio.gather(writing, return_exceptions=True)
+    return kinds[:CHOICES], world
+
+
+async def test_a_seed_repeats_choices_however_often_others_choose(monkeypatch: pytest.MonkeyPatch) -> None:
+    user = REGISTER_USERS[1]
+    first, world = await written(user, monkeypatch)
+    again, other_world = await written(user, monkeypatch, before=5)
+    assert first == again
+    fresh = made_world().rng.random()
+    assert world.rng.random() == other_world.rng.random() == fresh
+
+
+async def test_each_proxy_chooses_by_itself_what_it_loses() -> None:
+    machines = [SimpleNamespace(name=name, address="127.0.0.1") for name in ("m1", "m2")]
+    async with losing_proxies(cast("Any", machines), "127.0.0.1", SEED) as proxies:
+        first = {proxy.rng.random() for proxy in proxies}
+    async with losing_proxies(cast("Any", machines), "127.0.0.1", SEED) as proxies:
+        reverse = {proxy.rng.random() for proxy in reversed(list(proxies))}
+    assert len(first) == 2
+    assert first == reverse
+
+
+@pytest.mark.parametrize("error", [OSError("the disk is gone"), AssertionError("a write was lost")])
+def test_an_error_in_a_scenario_ends_only_that_one(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = (tmp_path / str(number) for number in itertools.count())
+
+    def make_folder(**_: object) -> str:
+        folder = next(folders)
+        folder.mkdir()
+        return str(folder)
+
+    async def run(scenario: Scenario, *_: object) -> None:
+        if scenario.name == "first":
+            raise error
+
+    scenarios = [Scenario(name, cast("Any", None)) for name in ("first", "second")]
+    monkeypatch.setattr(runs, "SCENARIOS", scenarios)
+    monkeypatch.setattr(runs, "_run", run)
+    monkeypatch.setattr(tempfile, "mkdtemp", make_folder)
+    monkeypatch.setattr(sys, "argv", ["faults", "--seed", "1"])
+    assert runs.main() == 1
+    said = capsys.readouterr().out
+    assert str(error) in said
+    assert "--- second" in said
+    assert "until the next write" in said
+    assert said.splitlines()[-1] == "failed with seed 1: first"
