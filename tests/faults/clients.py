@@ -15,7 +15,7 @@ import aiohttp
 from support.engine import until
 
 from faults.history import Expected, Fate, History
-from faults.machines import PATIENCE_S, Cluster
+from faults.machines import PATIENCE_S, Cluster, Machine
 from faults.seeds import generator
 from rce_master.leadership.core import STANDBY_HEADER
 
@@ -163,6 +163,13 @@ class Clients:
         url = (await self._cluster.leader()).url
         found = await self._asked("GET", f"{url}api/v1/machines")
         return {each["process"]: each["connected"] for each in found["machines"]}
+
+    async def drain(self, machine: Machine, *, drained: bool) -> None:
+        """Let a master lead only if no other one does, or let it lead again."""
+        url = (await self._cluster.leader()).url
+        method = "PUT" if drained else "DELETE"
+        found = await self._asked(method, f"{url}api/v1/machines/{machine.name}/drain")
+        assert [master["drained"] for master in found["masters"]] == [drained], found
 
     async def _make_tokens(self, used: int) -> None:
         async with self.session() as session:

@@ -11,7 +11,29 @@ from contextlib import asynccontextmanager, contextmanager
 
 from support.networks import NetworkMachine
 
+from rce.config.store_address import ETCD_PORT
+
 _START_S = 90.0
+
+
+FROM_ETCD = (
+    ("OUTPUT", "-p", "tcp", "--dport", str(ETCD_PORT)),
+    ("INPUT", "-p", "tcp", "--sport", str(ETCD_PORT)),
+)
+"""Rules that cut the master of a machine off from all members of etcd."""
+
+
+def between(other: NetworkMachine, port: int | None, chains: Sequence[str]) -> list[Sequence[str]]:
+    """Return rules that cut a machine off from another one.
+
+    Args:
+        other: The other one.
+        port: At either end; None: all packets.
+        chains: INPUT, OUTPUT, or both of them.
+    """
+    ports = [("-p", "tcp", end, str(port)) for end in ("--sport", "--dport")] if port else [()]
+    side = {"INPUT": "-s", "OUTPUT": "-d"}
+    return [(chain, side[chain], other.address, *each) for chain in chains for each in ports]
 
 
 @contextmanager

@@ -49,6 +49,10 @@ class World:
     def __post_init__(self) -> None:
         self.rng = generator(self.seed, "scenario")
 
+    def rounds(self, count: int) -> int:
+        """Return how often to do what the long run of 100 rounds does so many times."""
+        return max(1, round(count * self.scale / 100))
+
     async def until_written(self, what: str, since: float) -> float:
         """Note how long it took until a write was acknowledged that was asked for after a fault."""
 
@@ -60,16 +64,16 @@ class World:
         self.times.add(what, end - since)
         return end
 
-    async def until_handed_over(self, former: Machine, since: float) -> None:
+    async def until_handed_over(self, former: Machine, since: float, what: str) -> None:
         """Wait until another master leads, and note the longest time without an acknowledged write.
 
-        The former leader may still acknowledge what is asked for after the signal: the first write after it
+        The former leader may still acknowledge what is asked for after it was told: the first write after it
         would not tell how long the others waited.
         """
         await self.cluster.leader(but=former)
         await self.clients.wait_for_writes()
         pause = self.history.longest_pause(since, time.monotonic())
-        self.times.add("SIGTERM of the leading master", pause)
+        self.times.add(what, pause)
 
     async def until_task_sets_are_back(self, since: float) -> None:
         """Note how long it took until all task sets are connected to the leading master."""

@@ -10,25 +10,29 @@ from contextlib import asynccontextmanager
 
 from support.engine import until
 
-from faults.machines import PATIENCE_S, Machine, send
+from faults.machines import PATIENCE_S, Machine, fetch, send
+from faults.scenarios.etcd import lead_etcd
 from faults.world import World
 
-ROUNDS = 2
 LONG_ROUNDS = 25
 """Of each kind."""
 STOP_S = 6.0
 LONG_STOP_S = 30.0
+LONG_ETCD_STOPS = 5
+"""Of each kind."""
+TERMINATED = "SIGTERM of the leading master"
 
 
 async def kill(world: World) -> None:
     """Kill the leading master, etcd's leader, both, or a stand-by, in turn, at any moment of a save."""
-    rounds = ROUNDS if world.scale == 1 else round(LONG_ROUNDS * world.scale / 100)
-    kinds = (_kill_leader, _kill_etcd, _kill_both, _kill_standby) * max(1, rounds)
-    for kind in kinds if world.scale > 1 else kinds[:4]:
-        await asyncio.sleep(world.rng.uniform(0, 0.5))  # at which moment of a save is left to chance
-        since = await kind(world)
-        await world.until_task_sets_are_back(since)
-        await world.whole()
+    kinds = (_kill_leader, _kill_etcd, _kill_both, _kill_standby)
+    on_one_machine = (_kill_leader, _kill_etcd, _kill_one_machine, _kill_standby)
+    for number in range(world.rounds(LONG_ROUNDS)):
+        for kind in on_one_machine if number % 2 else kinds:
+            await asyncio.sleep(world.rng.uniform(0, 0.5))  # at which moment of a save is left to chance
+            since = await kind(world)
+            await world.until_task_sets_are_back(since)
+            await world.whole()
 
 
 async def _kill_leader(world: World) -> float:
@@ -50,6 +54,14 @@ async def _kill_both(world: World) -> float:
     since = time.monotonic()
     await asyncio.gather(leader.master.kill(), member.member.kill())
     return await world.until_written("kill -9 of both", since)
+
+
+async def _kill_one_machine(world: World) -> float:
+    leader = await world.cluster.leader()
+    await lead_etcd(world, leader)
+    since = time.monotonic()
+    await asyncio.gather(leader.master.kill(), leader.member.kill())
+    return await world.until_written("kill -9 of both on one machine", since)
 
 
 async def _kill_standby(world: World) -> float:
@@ -101,15 +113,55 @@ async def _stopped(world: World) -> AsyncIterator[tuple[Machine, float]]:
     await until(noticed, timeout=PATIENCE_S, what="the master that was stopped says that it leads no more")
 
 
+async def stop_etcd(world: World) -> None:
+    """Stop members of etcd, which end no connection: the one that leads, and those that masters ask first."""
+    for _ in range(world.rounds(LONG_ETCD_STOPS)):
+        await _stop_member(world, await world.cluster.etcd_leader(), "etcd's leader")
+        leader, standby = await world.cluster.leader(), await world.standby()
+        await lead_etcd(world, standby)
+        await _stop_member(world, leader, "the leading master's member")
+        leader, standby = await world.cluster.leader(), await world.standby()
+        await lead_etcd(world, leader)
+        await _stop_member(world, standby, "a stand-by's member")
+
+
+async def _stop_member(world: World, machine: Machine, what: str) -> None:
+    since = time.monotonic()
+    send(machine.member, signal.SIGSTOP)
+    try:
+        assert not await fetch(f"http://{machine.etcd}/health"), (
+            f"the member of {machine.name} is not stopped"
+        )
+        end = await world.until_written(f"stop of {what}", since)
+        await world.until_task_sets_are_back(end)
+        await asyncio.sleep(max(0.0, since + STOP_S - time.monotonic()))
+    finally:
+        send(machine.member, signal.SIGCONT)
+    await world.whole()
+
+
 async def terminate(world: World) -> None:
     """End the leading master with SIGTERM, so that it hands over, at any moment of a save."""
-    for _ in range(1 if world.scale == 1 else max(1, round(LONG_ROUNDS * world.scale / 100))):
+    for _ in range(world.rounds(LONG_ROUNDS)):
         await asyncio.sleep(world.rng.uniform(0, 0.5))
         leader = await world.cluster.leader()
         since = time.monotonic()
         assert await leader.master.stop() == 0
-        await world.until_handed_over(leader, since)
+        await world.until_handed_over(leader, since, TERMINATED)
         await world.until_task_sets_are_back(since)
+        await world.whole()
+
+
+async def drain(world: World) -> None:
+    """Drain the leading master, as ``rce drain`` does, so that it hands over while it runs on."""
+    for _ in range(world.rounds(LONG_ROUNDS)):
+        await asyncio.sleep(world.rng.uniform(0, 0.5))
+        leader = await world.cluster.leader()
+        since = time.monotonic()
+        await world.clients.drain(leader, drained=True)
+        await world.until_handed_over(leader, since, "drain of the leading master")
+        await world.until_task_sets_are_back(since)
+        await world.clients.drain(leader, drained=False)
         await world.whole()
 
 
@@ -120,7 +172,7 @@ async def upgrade(world: World) -> None:
         since = time.monotonic()
         assert await machine.master.stop() == 0
         if leads:
-            await world.until_handed_over(machine, since)
+            await world.until_handed_over(machine, since, TERMINATED)
         await machine.member.stop()
         await world.clients.wait_for_writes()
         await world.whole()

@@ -4,19 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AbstractContextManager, AsyncExitStack, ExitStack, asynccontextmanager
+from typing import TypeAlias
 
 from support.engine import until
 
 from faults.answers import losing_proxies
+from faults.goals import WITH_ETCD
 from faults.machines import CONTROL_PORT, PATIENCE_S, PEER_PORT, Machine, is_reached
-from faults.networks import dropped, slow, unplugged
+from faults.networks import FROM_ETCD, between, dropped, slow, unplugged
+from faults.scenarios.etcd import lead_etcd
 from faults.world import World
 from rce.config.store_address import ETCD_PORT
 
 CUT_S = 7.0
 LONG_CUT_S = 12.0
+LONG_ROUNDS = 12
+"""Of each kind of cut."""
+LONG_PAIRS = 20
+Cut: TypeAlias = Callable[[Machine], AbstractContextManager[None]]
+Rules: TypeAlias = Sequence[Sequence[str]]
+BOTH_WAYS = ("INPUT", "OUTPUT")
+WAYS = (BOTH_WAYS, ("INPUT",), ("OUTPUT",))
+PORTS = (ETCD_PORT, PEER_PORT, CONTROL_PORT, None)
+ALL = (("INPUT", "-i", "eth0"), ("OUTPUT", "-o", "eth0"))
+"""Rules that cut a machine off from all others."""
 DELAY_S, LOSS = 0.2, 0.05
 SLOW_S = 8.0
 LOST_SHARE = 0.05
@@ -25,42 +38,74 @@ LONG_SLOW_S = 60.0
 
 
 async def cut(world: World) -> None:
-    """Cut the leading master off: from all, one way, from etcd only, and from the task sets only."""
-    await _cut(world, "machine cut off", lambda machine: unplugged(machine.place))
-    await _cut(
-        world, "machine hears nothing", lambda machine: dropped([machine.place], ("INPUT", "-i", "eth0"))
-    )
-    await _cut(
-        world, "machine says nothing", lambda machine: dropped([machine.place], ("OUTPUT", "-o", "eth0"))
-    )
-    from_etcd = [
-        (chain, "-p", "tcp", way, str(ETCD_PORT))
-        for chain, way in (("OUTPUT", "--dport"), ("INPUT", "--sport"))
-    ]
-    await _cut(
-        world,
-        "master cut off from etcd",
-        lambda machine: dropped([machine.place], *from_etcd),
-        from_clients=False,
-    )
+    """Cut the leading master off from all, one way, and from etcd; every second time with etcd's leader."""
+    for number in range(world.rounds(LONG_ROUNDS)):
+        for what, make in CUTS.items():
+            await _cut(world, what, make, with_etcd=number % 2 == 1)
 
 
-async def _cut(
-    world: World,
-    what: str,
-    make: Callable[[Machine], AbstractContextManager[None]],
-    *,
-    from_clients: bool = True,
-) -> None:
+async def _cut(world: World, what: str, make: Cut, *, with_etcd: bool) -> None:
     leader = await world.cluster.leader()
+    if with_etcd:
+        await lead_etcd(world, leader)
+        what += WITH_ETCD
+    await asyncio.sleep(world.rng.uniform(0, 0.5))
     with make(leader):
         since = time.monotonic()
         end = await world.until_written(what, since)
         await world.cluster.leader(but=leader)
         await world.until_task_sets_are_back(end)
         await asyncio.sleep(max(0.0, since + _seconds(world) - time.monotonic()))
-    if from_clients:
+    if make is not cut_from_etcd:
         world.history.cuts.append((leader.name, since, time.monotonic()))
+    await world.whole()
+
+
+def cut_from_etcd(machine: Machine) -> AbstractContextManager[None]:
+    """Cut a master off from all members of etcd; clients reach it."""
+    return dropped([machine.place], *FROM_ETCD)
+
+
+CUTS: dict[str, Cut] = {
+    "machine cut off": lambda machine: unplugged(machine.place),
+    "machine hears nothing": lambda machine: dropped([machine.place], ("INPUT", "-i", "eth0")),
+    "machine says nothing": lambda machine: dropped([machine.place], ("OUTPUT", "-o", "eth0")),
+    "master cut off from etcd": cut_from_etcd,
+}
+
+
+async def cut_pairs(world: World) -> None:
+    """Cut machines off from single others: one or both ways, at one port or all, several pairs at once."""
+    machines = world.cluster.machines
+    one, other, _ = world.rng.sample(machines, 3)
+    await _cut_some(world, [(one, between(other.place, None, BOTH_WAYS))])
+    leader = await world.cluster.etcd_leader()
+    peers = [each.place for each in machines if each is not leader]
+    await _cut_some(world, [(leader, between(peer, PEER_PORT, BOTH_WAYS)) for peer in peers])
+    await _cut_some(world, [(await world.standby(), ALL)])
+    await _cut_some(world, [(each, ALL) for each in world.rng.sample(machines, 2)])
+    for _ in range(world.rounds(LONG_PAIRS)):
+        await _cut_some(world, [_draw(world) for _ in range(world.rng.randint(1, 4))])
+
+
+def _draw(world: World) -> tuple[Machine, Rules]:
+    """Choose a machine, and rules that cut it off from another one."""
+    rng, cluster = world.rng, world.cluster
+    machine = rng.choice(cluster.machines)
+    others = [*(each.place for each in cluster.machines if each is not machine), cluster.server]
+    return machine, between(rng.choice(others), rng.choice(PORTS), rng.choice(WAYS))
+
+
+async def _cut_some(world: World, cuts: Sequence[tuple[Machine, Rules]]) -> None:
+    since = time.monotonic()
+    with ExitStack() as stack:
+        for machine, rules in cuts:
+            stack.enter_context(dropped([machine.place], *rules))
+        await asyncio.sleep(world.rng.uniform(2.0, CUT_S))
+    end = time.monotonic()
+    world.history.cuts += [(machine.name, since, end) for machine, rules in cuts if rules is ALL]
+    written = await world.until_written("pairs of machines cut off, and back", end)
+    await world.until_task_sets_are_back(written)
     await world.whole()
 
 

@@ -6,6 +6,8 @@ import asyncio
 import itertools
 import sys
 import tempfile
+from collections import Counter
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,16 +18,19 @@ from faults import clients
 from faults.answers import losing_proxies
 from faults.catalogue import Scenario
 from faults.clients import REGISTER_USERS, Clients
-from faults.goals import Times
+from faults.goals import WITH_ETCD, Times
 from faults.history import Fate, History
+from faults.networks import between
+from faults.scenarios import kill, network
 from faults.world import World
+from support.networks import NetworkMachine
 
 SEED = 7
 CHOICES = 20
 
 
-def made_world(writers: Clients | None = None) -> World:
-    return World(cast("Any", None), cast("Any", writers), History(), Times(), SEED)
+def made_world(writers: Clients | None = None, scale: float = 1.0) -> World:
+    return World(cast("Any", None), cast("Any", writers), History(), Times(), SEED, scale)
 
 
 async def written(user: str, monkeypatch: pytest.MonkeyPatch, *, before: int = 0) -> tuple[list[str], World]:
@@ -96,3 +101,56 @@ def test_an_error_in_a_scenario_ends_only_that_one(
     assert "--- second" in said
     assert "until the next write" in said
     assert said.splitlines()[-1] == "failed with seed 1: first"
+
+
+async def test_each_kind_of_kill_is_done_25_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the long run; both processes are on one machine every second time."""
+    done: Counter[str] = Counter()
+
+    def counted(name: str) -> Callable[[World], Awaitable[float]]:
+        async def kind(_: World) -> float:
+            done[name] += 1
+            return 0.0
+
+        return kind
+
+    names = ("_kill_leader", "_kill_etcd", "_kill_both", "_kill_one_machine", "_kill_standby")
+    for name in names:
+        monkeypatch.setattr(kill, name, counted(name))
+    world = made_world(scale=100.0)
+    monkeypatch.setattr(world.rng, "uniform", lambda *_: 0.0)
+    monkeypatch.setattr(World, "whole", counted("whole"))
+    await kill.kill(world)
+    assert [done[name] for name in names] == [25, 25, 13, 12, 25]
+
+
+async def test_etcds_leader_is_cut_off_every_second_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: Counter[tuple[str, bool]] = Counter()
+
+    async def cut(_: World, what: str, __: object, *, with_etcd: bool) -> None:
+        done[what, with_etcd] += 1
+
+    monkeypatch.setattr(network, "_cut", cut)
+    await network.cut(made_world(scale=100.0))
+    assert done == {(what, with_etcd): 6 for what in network.CUTS for with_etcd in (False, True)}
+
+
+def test_each_cut_of_the_leading_master_has_a_goal() -> None:
+    times = Times()
+    for what in network.CUTS:
+        times.add(what, 1.0)
+        times.add(what + WITH_ETCD, 1.0)
+    for line in list(times.table())[1:]:
+        assert line.split()[-2:] == ["<", "8"]
+
+
+def test_a_cut_between_two_machines_has_rules_for_each_way() -> None:
+    other = NetworkMachine("there", "10.77.0.2", "switch", "port2")
+    assert between(other, None, network.BOTH_WAYS) == [
+        ("INPUT", "-s", "10.77.0.2"),
+        ("OUTPUT", "-d", "10.77.0.2"),
+    ]
+    assert between(other, 2380, ("INPUT",)) == [
+        ("INPUT", "-s", "10.77.0.2", "-p", "tcp", "--sport", "2380"),
+        ("INPUT", "-s", "10.77.0.2", "-p", "tcp", "--dport", "2380"),
+    ]
