@@ -37,12 +37,17 @@ class Expected(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A master's message to a task set, in seconds since the start of the machine."""
+    """A master's message to a task set, in seconds since the start of the machine.
+
+    Attributes:
+        after: It was sent after this time: that of the newest request that was answered on its connection.
+    """
 
     at: float
     master: str
     term: int
     message: str
+    after: float = -math.inf
 
 
 @dataclass
@@ -222,7 +227,11 @@ class History:
         )
 
     def of_older_terms(self) -> Iterable[str]:
-        """Yield what was heard of masters that led no more, and of two that led at once."""
+        """Yield what was heard of masters that led no more, and of two that led at once.
+
+        What was on its way when a newer term began may come late. An answer to a request that was made after
+        that, and all that follows it on its connection, was not on its way.
+        """
         begun: dict[int, float] = {}
         leaders: dict[int, str] = {}
         for each in self.heard:
@@ -232,7 +241,8 @@ class History:
         begun_to_send = list(self.stops)
         for each in self.heard:
             newer = min((at for term, at in begun.items() if term > each.term), default=math.inf)
-            if each.at <= newer + DELIVERY_S or self._is_late(each):
+            is_held_up = each.at <= newer + DELIVERY_S or self._is_late(each)
+            if each.after <= newer and is_held_up:
                 continue
             stop = next((stop for stop in begun_to_send if _ended(stop, each)), None)
             if stop is not None:

@@ -81,18 +81,22 @@ class Prober:
     async def _listen(self, machine: Machine) -> None:
         url = f"ws://{machine.address}:{CONTROL_PORT}/"
         headers = {"Authorization": f"Bearer {SECRET}"}
-        term = 0
+        term, asked = 0, dict[int, float]()
         async with connect(url, additional_headers=headers, open_timeout=60, ping_interval=None) as socket:
+            after = time.monotonic()
             await socket.send(encode(_hello(machine.name)))
-            asking = asyncio.create_task(_ask(socket))
+            asking = asyncio.create_task(_ask(socket, asked))
             try:
                 async for frame in socket:
                     message = decode_to_task_set(frame)
                     if isinstance(message, Welcome):
                         term = message.term
+                    if isinstance(message, ClientReply):
+                        after = max(after, asked.pop(message.request))
                     if term:
                         kind = type(message).__name__
-                        self._history.heard.append(Heard(time.monotonic(), machine.name, term, kind))
+                        heard = Heard(time.monotonic(), machine.name, term, kind, after)
+                        self._history.heard.append(heard)
             finally:
                 asking.cancel()
                 await asyncio.gather(asking, return_exceptions=True)
@@ -105,10 +109,16 @@ def _hello(name: str) -> Hello:
     return Hello(version=CONTROL_VERSION, kind=kind, process=f"prober-{name}", machine=machine)
 
 
-async def _ask(socket: ClientConnection) -> None:
-    """Ask for a container of a robot that is not connected, which is refused at once, until cancelled."""
+async def _ask(socket: ClientConnection, asked: dict[int, float]) -> None:
+    """Ask for a container of a robot that is not connected, which is refused at once, until cancelled.
+
+    Args:
+        socket: The connection.
+        asked: Gets the time of each request, by its number.
+    """
     for number in itertools.count(1):
         await asyncio.sleep(ASK_S)
+        asked[number] = time.monotonic()
         await socket.send(encode(ClientRequest(request=number, id="prober/none", type="CC", data=None)))
 
 

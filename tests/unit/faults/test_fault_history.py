@@ -147,6 +147,14 @@ def test_what_a_cut_held_up_is_no_act_of_an_older_term() -> None:
     assert History(heard=heard, cuts=[("m1", 2, 5)]).violations([], 0) != []
 
 
+def test_an_answer_to_a_later_request_is_an_act_of_a_cut_master() -> None:
+    heard = [Heard(1, "m1", 1, "Sync"), Heard(5, "m2", 2, "Sync"), Heard(12, "m1", 1, "ClientReply", 4.9)]
+    assert History(heard=heard, cuts=[("m1", 2, 10)]).violations([], 0) == []
+    for late in (Heard(12, "m1", 1, "ClientReply", 5.1), Heard(5.2, "m1", 1, "Welcome", 5.1)):
+        history = History(heard=[*heard, late], cuts=[("m1", 2, 10)])
+        assert len(history.violations([], 0)) == 1
+
+
 def test_a_stopped_master_may_have_begun_to_send_one_message() -> None:
     heard = [Heard(1, "m1", 1, "Sync"), Heard(5, "m2", 2, "Sync"), Heard(12, "m1", 1, "Welcome")]
     assert History(heard=heard, stops=[("m1", 11.9)]).violations([], 0) == []

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import pytest
 from faults import __main__ as runs
-from faults import clients
+from faults import clients, task_sets
 from faults.answers import losing_proxies
 from faults.catalogue import Scenario
 from faults.clients import REGISTER_USERS, Clients
@@ -22,8 +22,15 @@ from faults.goals import WITH_ETCD, Times
 from faults.history import Fate, History
 from faults.networks import between
 from faults.scenarios import kill, network
+from faults.task_sets import Prober
 from faults.world import World
+from support.engine import until
 from support.networks import NetworkMachine
+from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import serve as serving
+
+from rce.control import decode_to_master, encode
+from rce.control.messages import ClientReply, ClientRequest, Welcome
 
 SEED = 7
 CHOICES = 20
@@ -154,3 +161,28 @@ def test_a_cut_between_two_machines_has_rules_for_each_way() -> None:
         ("INPUT", "-s", "10.77.0.2", "-p", "tcp", "--sport", "2380"),
         ("INPUT", "-s", "10.77.0.2", "-p", "tcp", "--dport", "2380"),
     ]
+
+
+async def test_a_prober_notes_when_what_was_answered_was_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    answered = asyncio.Event()
+
+    async def serve(socket: ServerConnection) -> None:
+        await socket.recv()
+        await socket.send(encode(Welcome(version=1, master="m1", term=1)))
+        request = decode_to_master(await socket.recv())
+        assert isinstance(request, ClientRequest)
+        await socket.send(encode(ClientReply(request=request.request)))
+        await socket.send(encode(Welcome(version=1, master="m1", term=1)))
+        await answered.wait()
+
+    history = History()
+    async with serving(serve, "127.0.0.1", 0) as server:
+        port = next(iter(server.sockets)).getsockname()[1]
+        monkeypatch.setattr(task_sets, "CONTROL_PORT", port)
+        machine = SimpleNamespace(address="127.0.0.1", name="m1")
+        async with Prober(cast("Any", SimpleNamespace(machines=[machine])), history).running():
+            await until(lambda: len(history.heard) == 3, timeout=60.0, what="all messages are heard")
+        answered.set()
+    welcome, reply, follows = history.heard
+    assert welcome.after < welcome.at < reply.after < reply.at
+    assert follows.after == reply.after
