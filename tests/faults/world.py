@@ -148,14 +148,16 @@ class World:
         return self.rng.choice([each for each in self.cluster.machines if each is not leader])
 
 
-def count_checked(times: Times, history: History, stored: list[str], misplaced: list[str]) -> None:
+def count_checked(
+    times: Times, history: History, stored: list[str], misplaced: list[str], robots: int
+) -> None:
     """Note what was checked of a history, and how much of it was wrong."""
     lost = len(list(history.lost(Counter(stored))))
     times.checked("requests, lost or done twice", len(history.made) - lost, lost)
     acts = len(list(history.of_older_terms()))
     times.checked("messages to task sets, by a former leader", len(history.heard) - acts, acts)
     times.checked("reads, not linearizable", history.reads, len(list(history.not_linearizable(INITIAL))))
-    times.checked("robots' links, interrupted", 1, len(history.lost_links))
+    times.checked("robots' links, interrupted", robots, len(history.lost_links))
     wrong = len(misplaced) + len(list(history.wrong_containers()))
     times.checked("containers, not as acknowledged", len(history.containers), wrong)
 
@@ -191,7 +193,7 @@ async def world(
             if robot:
                 await made.until_containers_are_right()
         stored = await clients.stored()
-        count_checked(times, history, stored, made.misplaced)
+        count_checked(times, history, stored, made.misplaced, robots=int(robot))
         violations = [*history.violations(stored, INITIAL), *made.misplaced]
         if made.robot is not None:
             times.add("longest gap of the robot's echo", made.robot.longest_gap)
