@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import time
 from collections import deque
@@ -170,6 +171,39 @@ class Clients:
         method = "PUT" if drained else "DELETE"
         found = await self._asked(method, f"{url}api/v1/machines/{machine.name}/drain")
         assert [master["drained"] for master in found["masters"]] == [drained], found
+
+    async def check_refusal(self, machine: Machine) -> None:
+        """Check that a master without a lead refuses a write, and says when to ask again."""
+        url, body = f"{machine.url}api/v1/robot-tokens", {"robot": "refused"}
+        async with self.session() as session, session.post(url, json=body) as reply:
+            told = reply.status, reply.headers.get("Retry-After")
+            assert told == (HTTPStatus.SERVICE_UNAVAILABLE, "1"), await reply.text()
+
+    @asynccontextmanager
+    async def events(self) -> AsyncIterator[list[int]]:
+        """Follow all events until it is left; yield their ids, which grow longer meanwhile."""
+        ids: list[int] = []
+        following = asyncio.create_task(self._follow_events(ids))
+        try:
+            yield ids
+        finally:
+            following.cancel()
+            results = await asyncio.gather(following, return_exceptions=True)
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+
+    async def _follow_events(self, ids: list[int]) -> None:
+        for used in itertools.count():
+            headers = {"Last-Event-ID": str(ids[-1])} if ids else {}
+            with contextlib.suppress(*_FAILURES):
+                async with (
+                    self.session(PATIENCE_S) as session,
+                    session.get(f"{self._url(used)}api/v1/events", headers=headers) as reply,
+                ):
+                    async for line in reply.content:
+                        ids += [int(line[3:])] if line.startswith(b"id:") else []
+            await asyncio.sleep(PAUSE_S)
 
     async def _make_tokens(self, used: int) -> None:
         async with self.session() as session:

@@ -76,6 +76,11 @@ class Machine:
         """Of the member, for clients."""
         return f"{self.address}:{ETCD_PORT}"
 
+    @property
+    def state(self) -> Path:
+        """The state folder of the master."""
+        return self.master_state or self.data.parent / "master"
+
     async def start_etcd(self, machines: list[Machine]) -> None:
         """Start the member."""
         clients, peers = f"http://{self.etcd}", f"http://{self.address}:{PEER_PORT}"
@@ -105,7 +110,7 @@ class Machine:
                 store,
             ),
             *("--lease", str(LEASE_S), "--machine", self.name, "--bind", "0.0.0.0"),
-            *("--state-dir", str(self.master_state or self.data.parent / "master")),
+            *("--state-dir", str(self.state)),
         ]
         self.master.env = {**self.env, **self.master_env}
         await self.master.start(ready="rce-master stand-by: ", timeout=PATIENCE_S)

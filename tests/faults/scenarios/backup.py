@@ -40,7 +40,7 @@ async def restore(world: World) -> None:
 
 async def _rce(world: World, at: Machine, command: str, file: Path) -> None:
     """Run ``rce backup`` or ``rce restore`` on the machine of a master."""
-    options = ("--store", world.cluster.store_of(at), "--state-dir", str(at.data.parent / "master"))
+    options = ("--store", world.cluster.store_of(at), "--state-dir", str(at.state))
     process = await asyncio.create_subprocess_exec(
         *at.place.prefix,
         *(str(Path(sys.executable).parent / "rce"), command, str(file), *options),

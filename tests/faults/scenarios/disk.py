@@ -61,9 +61,9 @@ async def full_disk(world: World) -> None:
         await register_key(world, first)
         async with world.lead_stays("a master's full disk"):
             assert await push(world, first, "room") == 200
-            fill(two / "ballast")
+            await fill(two / "ballast")
             assert await push(world, first, "full_standby") == 200
-            fill(one / "ballast")
+            await fill(one / "ballast")
             assert await push(world, first, "full_both") == UNAVAILABLE
             await world.clients.wait_for_writes(10)
             (two / "ballast").unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import os
 import shutil
 import subprocess
@@ -18,7 +19,9 @@ import aiohttp
 from support.engine import until
 
 from faults.machines import PATIENCE_S, PEER_PORT, Machine
+from faults.networks import FROM_ETCD, dropped
 from faults.world import World
+from rce_master.events import IDS_OF_TERM
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError
 from rce_master.store.etcd.wire import Delete, Put
@@ -44,18 +47,40 @@ _SOURCE = Path(__file__).parent.parent / "slow_fsync.c"
 
 
 async def away(world: World) -> None:
-    """End all members of etcd, forget the revisions of before, and start them again."""
+    """End all members of etcd, and start them again; let them forget revisions that a stand-by misses."""
     for machine in world.cluster.machines:
         await machine.member.kill()
     await asyncio.sleep(AWAY_S if world.scale == 1 else LONG_AWAY_S)
     await world.until_no_master_leads()
+    for machine in world.cluster.machines:
+        await world.clients.check_refusal(machine)
     since = time.monotonic()
     for machine in world.cluster.machines:
         await machine.start_etcd(world.cluster.machines)
     end = await world.until_written("etcd away, and back", since)
     await world.until_task_sets_are_back(end)
-    await compact(world.cluster.machines)
-    await world.clients.wait_for_writes()
+    await world.whole()
+    await miss_revisions(world)
+
+
+async def miss_revisions(world: World) -> None:
+    """Cut a stand-by off from etcd until what it misses is forgotten: it must load its copy anew."""
+    standby = await world.standby()
+    said = len(standby.master.output())
+
+    async def misses_etcd() -> bool:
+        return "etcd" in (await standby.health()).get("status", "")
+
+    with dropped([standby.place], *FROM_ETCD):
+        await until(misses_etcd, timeout=PATIENCE_S, what=f"the master of {standby.name} misses etcd")
+        await world.clients.wait_for_writes()
+        await compact(world.cluster.machines)
+    await until(
+        lambda: "loads its copy of the state anew: etcd has compacted" in standby.master.output()[said:],
+        timeout=PATIENCE_S,
+        what=f"the master of {standby.name} loads its copy anew",
+    )
+    await world.whole()
 
 
 async def compact(machines: list[Machine]) -> None:
@@ -67,6 +92,14 @@ async def compact(machines: list[Machine]) -> None:
 
 async def clocks(world: World) -> None:
     """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn."""
+    async with world.clients.events() as ids:
+        await _lead_with_wrong_clocks(world)
+    assert all(before < after for before, after in itertools.pairwise(ids)), f"ids do not grow: {ids}"
+    terms = {event // IDS_OF_TERM for event in ids}
+    assert len(terms) > len(CLOCKS), f"events of too few terms: {sorted(terms)}"
+
+
+async def _lead_with_wrong_clocks(world: World) -> None:
     for jump in CLOCKS:
         leader = await world.cluster.leader()
         right = [each for each in world.cluster.machines if each is not leader and not each.master_env]
@@ -141,15 +174,20 @@ async def slow_disk(world: World) -> None:
     launcher, flag = build_slow_fsync(world), world.cluster.folder / "slow"
     leader = await world.cluster.etcd_leader()
     follower = world.rng.choice([each for each in world.cluster.machines if each is not leader])
+    fault = f"fsync of {FSYNC_S:g} s at"
     async with slowed(world, follower, launcher, flag):
+        term = await world.term()
         since = time.monotonic()
-        await world.until_written(f"fsync of {FSYNC_S:g} s at a follower of etcd", since)
+        await world.until_written(f"{fault} a follower of etcd", since)
         await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
         await world.clients.wait_for_writes()
+        world.times.add(f"terms begun under {fault} a follower", await world.term() - term)
     async with slowed(world, follower, launcher, flag, leads=True):
+        term = await world.term()
         await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
         since = time.monotonic()
-    await world.until_written(f"fsync of {FSYNC_S:g} s at etcd's leader, and back", since)
+    await world.until_written(f"{fault} etcd's leader, and back", since)
+    world.times.add(f"terms begun under {fault} etcd's leader", await world.term() - term)
 
 
 def build_slow_fsync(world: World) -> Path:
@@ -203,10 +241,13 @@ async def lead_etcd(world: World, chosen: Machine) -> None:
 
 
 async def replace_member(world: World) -> None:
-    """Lose the data of a member for good, and put an empty one in its place."""
+    """Lose the data of a machine's member and master for good, and put empty ones in their place."""
     lost, *others = world.rng.sample(world.cluster.machines, len(world.cluster.machines))
-    await lost.member.kill()
+    since = time.monotonic()
+    await asyncio.gather(lost.member.kill(), lost.master.kill())
     shutil.rmtree(lost.data / "data")
+    shutil.rmtree(lost.state)
+    await world.until_written("a machine and its disk lost", since)
     members = (await post(others[0], "v3/cluster/member/list", {}))["members"]
     (number,) = [each["ID"] for each in members if each.get("name") == lost.name]
     await post(others[0], "v3/cluster/member/remove", {"ID": number})
@@ -236,10 +277,10 @@ async def full_disk(world: World) -> None:
         ballast = {first: one / "ballast", second: two / "ballast"}
         await move_data(world, first, one)
         await move_data(world, second, two)
-        fill(ballast[first])
+        await fill(ballast[first])
         await grow(world, first)
         await world.clients.wait_for_writes(10)
-        fill(ballast[second])
+        await fill(ballast[second])
         await grow(world, second)
         await world.until_no_master_leads()
         since = time.monotonic()
@@ -309,7 +350,7 @@ def small_disk(world: World, machine: Machine) -> Iterator[Path]:
 async def move_data(world: World, machine: Machine, folder: Path) -> None:
     """Move a member's data to another folder."""
     await machine.member.kill()
-    shutil.copytree(machine.data, folder / "etcd")
+    await asyncio.to_thread(shutil.copytree, machine.data, folder / "etcd")
     machine.data = folder / "etcd"
     await world.whole()
 
@@ -327,8 +368,12 @@ async def grow(world: World, machine: Machine) -> None:
         await until(ended, timeout=PATIENCE_S, what=f"the member of {machine.name} ends for its full disk")
 
 
-def fill(file: Path) -> None:
-    """Fill a disk to the last byte."""
+async def fill(file: Path) -> None:
+    """Fill a disk to the last byte; the robot, whose pauses are timed, talks meanwhile."""
+    await asyncio.to_thread(_fill, file)
+
+
+def _fill(file: Path) -> None:
     with file.open("wb", buffering=0) as ballast, contextlib.suppress(OSError):
         while True:
             ballast.write(bytes(1 << 12))
