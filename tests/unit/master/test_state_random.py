@@ -80,6 +80,7 @@ class Histories(RuleBasedStateMachine):
         self.numbers: set[int] = set()
         self.revisions: dict[str, int] = {}
         self.replicas: dict[str, DesiredState] = {}
+        self.unsaved = 0
         for name in ("ann", "bob"):
             self.do(commands.AddUser(user=User(name=name, role=UserRole.ADMIN, password="", created=0.0)))
 
@@ -89,6 +90,11 @@ class Histories(RuleBasedStateMachine):
         try:
             changes = self.state.apply(command, self.now)
         except RefusedError:
+            assert self.image(persistent_only=False) == before
+            return
+        if self.unsaved:
+            self.unsaved -= 1
+            self.revert(changes)
             assert self.image(persistent_only=False) == before
             return
         for row in changes.rows():
@@ -107,6 +113,12 @@ class Histories(RuleBasedStateMachine):
             self.revisions[id_] = revision
         for drop in changes.withdrawals:
             assert drop.revision > self.revisions.get(drop.id, 0) or drop.id in changes.touched
+
+    def revert(self, changes: Changes) -> None:
+        """Take back what was not saved, with the work that was done in the same transaction."""
+        more = self.state.apply(commands.Continue(), self.now)
+        for each in (more, changes):
+            each.revert()
 
     def follow(self, changes: Changes) -> None:
         """Keep what a task set knows that is told of every change in patches."""
@@ -160,6 +172,11 @@ class Histories(RuleBasedStateMachine):
         assert {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints} == specs
         # Each master sets the times of these moves anew, and stores them with the next change.
         self.stored["volume_moves"] = self.image(persistent_only=True)["volume_moves"]
+
+    @rule(count=st.integers(1, 3))
+    def next_saves_fail(self, count: int) -> None:
+        """The store refuses what the next commands change."""
+        self.unsaved = count
 
     @rule(seconds=st.floats(0, 4))
     def tick(self, seconds: float) -> None:
