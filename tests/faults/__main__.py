@@ -22,7 +22,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="faults", description="Make faults, and check what the masters do.")
     parser.add_argument("--only", action="append", choices=names, help="Run this scenario only; repeatable.")
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6), help="Repeat a run's choices.")
-    parser.add_argument("--rounds", type=int, default=100, help="Kills, 4 for a SIGTERM; 1: as in the tests.")
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        default=100,
+        help="Kills, 4 for a SIGTERM or drain, 8 for a cut of a kind; 1: each kind once.",
+    )
     parser.add_argument("--keep", action="store_true", help="Keep the folder with all logs.")
     options = parser.parse_args()
     print(f"seed {options.seed}", flush=True)
