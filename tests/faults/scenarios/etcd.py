@@ -74,7 +74,8 @@ async def miss_revisions(world: World) -> None:
     with dropped([standby.place], *FROM_ETCD):
         await until(misses_etcd, timeout=PATIENCE_S, what=f"the master of {standby.name} misses etcd")
         await world.clients.wait_for_writes()
-        await compact(world.cluster.machines)
+        # A member asks itself at the port that is cut, so another one has to be told.
+        await compact([each for each in world.cluster.machines if each is not standby])
     await until(
         lambda: "loads its copy of the state anew: etcd has compacted" in standby.master.output()[said:],
         timeout=PATIENCE_S,
