@@ -56,7 +56,7 @@ async def etcd(folder: Path) -> AsyncIterator[tuple[list[str], list[psutil.Proce
                 *("etcd", "--name", f"m{number}", "--data-dir", str(folder / f"m{number}")),
                 *("--listen-client-urls", urls[0], "--advertise-client-urls", urls[0]),
                 *("--listen-peer-urls", urls[1], "--initial-advertise-peer-urls", urls[1]),
-                *("--initial-cluster", ",".join(names), "--log-level", "error"),
+                *("--initial-cluster", ",".join(names), "--pre-vote", "--log-level", "error"),
                 *("--max-txn-ops", str(MAX_OPERATIONS), "--max-request-bytes", str(16 << 20)),
             ]
             processes.append(

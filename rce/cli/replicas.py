@@ -23,7 +23,7 @@ _STAND_BY = " stand-by: "
 _OPTIONS = (
     *("--max-txn-ops", "4096", "--max-request-bytes", "16777216", "--quota-backend-bytes", "8589934592"),
     *("--auto-compaction-mode", "periodic", "--auto-compaction-retention", "5m"),
-    *("--logger", "zap", "--log-level", "error"),
+    *("--pre-vote", "--logger", "zap", "--log-level", "error"),
 )
 _BECOME = 'echo "etcd ready: $0"; exec "$@"'
 

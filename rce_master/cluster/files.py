@@ -32,6 +32,7 @@ _REVOCATION = ("ClientTLSInfo", "PeerTLSInfo")
 no key of its own for the list, only the names of its fields."""
 _FIXED = {
     "enable-grpc-gateway": True,  # etcd 3.4 leaves it out if a file configures it
+    "pre-vote": True,  # else a member that was cut off makes the others elect anew when it is back
     "max-txn-ops": MAX_OPERATIONS,
     "max-request-bytes": 16 * 2**20,
     "quota-backend-bytes": 8 * 2**30,

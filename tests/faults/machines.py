@@ -28,7 +28,7 @@ REACH_S = 0.5
 """How long a TCP connection may take over a network that is whole."""
 _CLONE_NEWNET = 0x40000000
 _ETCD_OPTIONS = (
-    *("--max-txn-ops", "4096", "--max-request-bytes", "16777216", "--log-level", "error"),
+    *("--max-txn-ops", "4096", "--max-request-bytes", "16777216", "--pre-vote", "--log-level", "error"),
     *("--initial-cluster-token", "faults"),
 )
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError, ValueError)

@@ -56,9 +56,11 @@ async def _cut(world: World, what: str, make: Cut, *, with_etcd: bool) -> None:
         await world.cluster.leader(but=leader)
         await world.until_task_sets_are_back(end)
         await asyncio.sleep(max(0.0, since + _seconds(world) - time.monotonic()))
+        term = await world.term()
     if make is not cut_from_etcd:
         world.history.cuts.append((leader.name, since, time.monotonic()))
     await world.whole()
+    world.times.add("terms begun when it is back", await world.term() - term)
 
 
 def cut_from_etcd(machine: Machine) -> AbstractContextManager[None]:

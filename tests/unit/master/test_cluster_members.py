@@ -129,7 +129,7 @@ def test_configuration_is_written_and_read(tmp_path: Path) -> None:
     own = machine(tmp_path / "state")
     own.write({"m1": own.peer_url, "m2": "https://10.0.0.2:2380"}, new=False)
     found = read_config(own.config)
-    assert found["max-txn-ops"] == 4096
+    assert (found["max-txn-ops"], found["pre-vote"]) == (4096, True)
     assert found["initial-cluster"] == "m1=https://10.0.0.1:2380,m2=https://10.0.0.2:2380"
     assert found["initial-cluster-state"] == "existing"
     assert found["peer-transport-security"] == found["client-transport-security"]
