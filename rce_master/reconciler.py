@@ -54,6 +54,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+SILENT_S = 3.5
+"""A robot task set that gave no sign of life for so long gets no robots if there is another one, and loses
+those that come to another one. Each gives one every 2 s
+(:class:`rce.control_channel.timeouts.ControlTimeouts`), and counts as gone after 10 s anyway."""
+
 
 class Peer(LogReader, Protocol):
     """A connected task set; in a running master an :class:`rce.control_channel.peer.Peer`."""
@@ -72,6 +77,9 @@ class Peer(LogReader, Protocol):
 
     def send(self, message: ToTaskSet) -> None:
         """Send a message; the next ``Sync`` makes up for a lost one."""
+
+    def abort(self) -> None:
+        """Abort the connection; a task set that lives dials again."""
 
     async def save_state(self, id: str, node: str) -> str:  # noqa: A002 - wire name
         """Have the state of a node saved now; return why it is not saved."""
@@ -244,10 +252,14 @@ class Reconciler:
             self._notify(notice)
 
     def probe(self, robot: str) -> None:
-        """Ask the task set of a robot whether the robot still responds."""
+        """Ask the task set of a robot whether the robot still responds; give one up that is silent itself."""
         found = self._state_service.tables.robot(robot)
-        if found is not None:
-            self._send(found.task_set, Probe(id=robot))
+        if found is None:
+            return
+        self._send(found.task_set, Probe(id=robot))
+        if self.silence(found.task_set) >= SILENT_S:
+            _log.warning("task set %s is silent while %s comes to another one", found.task_set, robot)
+            self._peers[found.task_set].abort()
 
     def _send_change(self, process: str, id_: str, touched: Touched) -> None:
         """Send the changes of an endpoint to its task set, and to the one it moves to."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rce.protocol import HandshakeError, master_reply, read_master_request
 from rce.web.entry import EntryAnswer
+from rce_master.reconciler import SILENT_S
 from rce_master.state import robots
 
 if TYPE_CHECKING:
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
     from rce_master.state.records import TaskSet
     from rce_master.state.tables import Tables
 
-SILENT_S = 3.5
-"""A task set that gave no sign of life for so long gets no robots, if there is another one. Each gives one
-every 2 s (:class:`rce.control_channel.timeouts.ControlTimeouts`), and counts as gone after 10 s."""
 EXPECTED_S = 5.0
 """How long a redirected robot counts at its task set before it has logged in."""
 

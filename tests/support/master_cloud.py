@@ -80,9 +80,13 @@ class FakePeer:
         self.requests = 0
         self.features: frozenset[str] = frozenset()
         self.silence = 0.0
+        self.aborts = 0
 
     def send(self, message: ToTaskSet) -> None:
         self.inbox.put_nowait(message)
+
+    def abort(self) -> None:
+        self.aborts += 1
 
     async def read_log(
         self,

@@ -65,6 +65,22 @@ async def test_a_robot_that_is_connected_elsewhere_is_looked_after(cloud: Cloud)
     assert (await second.login()).status == 200
 
 
+async def test_a_silent_task_set_is_given_up_for_its_robots(cloud: Cloud) -> None:
+    """It hangs or was cut off; its robots would have to wait until its connection counts as lost."""
+    first, second = cloud.robots(), cloud.robots("r2")
+    for peer in (first, second):
+        await peer.hello()
+    await first.login()
+    first.silence = 3.0
+    assert (await second.login()).status == 409
+    assert first.aborts == 0, "each is silent for a while"
+    first.silence = 4.0
+    assert (await second.login()).status == 409
+    assert first.aborts == 1
+    await cloud.control_handler.on_gone(first)
+    assert (await second.login()).status == 200
+
+
 async def test_robot_leaving_during_login_is_disconnected(cloud: Cloud) -> None:
     """A robot that leaves while it logs in is not connected for ever."""
     robots = cloud.robots()
