@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError, Port
@@ -13,7 +14,7 @@ from rce_robot.interface import RobotInterface, RobotSide
 from rce_robot.outgoing import Buffer, fresh_id
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator
+    from collections.abc import Callable, Coroutine, Iterator
 
     from rce.protocol import DataMessage, LargeData
     from rce_robot.forms import Form
@@ -30,24 +31,27 @@ class AskedByRobot(RobotInterface):
         """Start a call."""
         if self.form_in.costly:
             packed = self._pack(message)
-            work = self._convert_and_call(self.offload.read_value(packed), message.msg_id, len(packed))
+            read = partial(self.offload.read_value, packed)
+            work = self._convert_and_call(read, message.msg_id, len(packed))
             self._run(work, message.msg_id)
         else:
             self._run(self._call(self._read(message, self._warn), message.msg_id), message.msg_id)
 
     def take_large(self, large: LargeData) -> None:
         """Start a call."""
-        work = self._convert_and_call(self.read_large(large), large.address.msg_id, large.size)
+        work = self._convert_and_call(partial(self.read_large, large), large.address.msg_id, large.size)
         self._run(work, large.address.msg_id)
 
     def _run(self, work: Coroutine[Any, Any, None], msg_id: str) -> None:
         if not self.robot.run(work):
             raise BusyError.at(self.tag, msg_id, "too many calls wait for an answer")
 
-    async def _convert_and_call(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
+    async def _convert_and_call(
+        self, reading: Callable[[], Coroutine[Any, Any, Read]], msg_id: str, size: int
+    ) -> None:
         """Call with a request that another process converts."""
         with self._held(size, msg_id):
-            read = await reading
+            read = await reading()
         msg_id = read.msg_id or msg_id
         for warning in read.warnings:
             self._warn(warning)

@@ -235,6 +235,7 @@ class ProtocolStream:
         shallow = is_shallow(text, limits.max_depth)
         starred = _may_be_starred(text)
         value: Any = None
+        partial: _Serialized | None = None
         if shallow and not starred:
             message = decode_data(text)
             if message is not None:
@@ -257,7 +258,7 @@ class ProtocolStream:
             size = memory_of(value) if self._defer_large else len(text)
             complete, dropped = self._assembler.add_message(value, size, now)
         except ProtocolError as error:
-            return [Fault.of(error, call_of(value))]
+            return [Fault.of(error, call_of(value) if partial is None else partial.call)]
         return self._events(value if complete else None, dropped)
 
     def await_binaries(self, large: LargeData, ids: Collection[str], now: float) -> list[Event]:

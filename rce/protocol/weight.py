@@ -8,12 +8,14 @@ light; one that counts as heavy may turn out to be light.
 from __future__ import annotations
 
 import codecs
+import json
 import re
 from sys import getsizeof
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import Struct
 
+from rce.protocol.calls import text_id
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import NO_ID
 
@@ -39,7 +41,7 @@ _EDGE = 4096
 """Bytes at each end of a large message that hold its small values, before or after its one large value."""
 _TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
 _MESSAGE_TYPE = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
-_MSG_ID = re.compile(rb'"msgID"\s*:\s*"?([^"\\,}]{1,255})')
+_MSG_ID = re.compile(rb'"msgID"\s*:\s*("(?:[^"\\]|\\.){1,1536}"|-?[0-9][0-9.eE+-]{0,255})')
 _LATCH = re.compile(rb'"latch"\s*:\s*"([^"\\]{1,64})"')
 _MSG = re.compile(rb'"msg\*?"\s*:')
 _STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
@@ -155,9 +157,18 @@ def find_address(text: bytes) -> Address | None:
     head, tail = text[:_EDGE], text[-_EDGE:]
     msg = _MSG.search(head)
     head = head[: msg.start()] if msg is not None else head
-    tag, message_type, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _MESSAGE_TYPE, _MSG_ID))
+    tag, message_type = _find(_TAG, head, tail), _find(_MESSAGE_TYPE, head, tail)
     latch = _find(_LATCH, head, b"")
-    return Address(tag, message_type, msg_id or NO_ID, latch) if tag else None
+    return Address(tag, message_type, _read_id(_find(_MSG_ID, head, tail)), latch) if tag else None
+
+
+def _read_id(found: str) -> str:
+    """Return the id of a ``msgID`` as JSON writes it; :data:`NO_ID`: it is not a string or an integer."""
+    try:
+        id_ = text_id(json.loads(found)) if found else NO_ID
+    except (ValueError, RecursionError):
+        return NO_ID
+    return id_ if isinstance(id_, str) else NO_ID
 
 
 def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rce.model.requests import ConfigureComponents, CreateContainer
 from rce.protocol.codec import Frame, encode, encode_data, encode_message
 from rce.protocol.limits import Limits
-from rce.protocol.messages import DataMessage, InterfaceStatus
+from rce.protocol.messages import CallId, DataMessage, InterfaceStatus
 from rce.protocol.requests import MAX_ITEMS, STEP_ITEMS, read_request
 from rce.protocol.stream import Event, Fault, LongRequest, ProtocolStream
 
@@ -410,6 +410,14 @@ def test_second_serialized_message_with_the_same_id_is_refused() -> None:
     assert stream.feed(serialized(ID), 0.0) == [Fault(f"binary value {ID} is referred to twice")]
     (message,) = stream.feed(binary(ID, b"x"), 0.0)
     assert isinstance(message, DataMessage)
+
+
+def test_a_refused_serialized_message_names_its_call() -> None:
+    stream = ProtocolStream.for_engine()
+    stream.feed(serialized(ID, msgID="c1"), 0.0)
+    (fault,) = stream.feed(serialized(ID, msgID="c2"), 0.0)
+    assert isinstance(fault, Fault)
+    assert fault.call == CallId("i", "c2")
 
 
 def test_serialized_message_expires_and_leaves_nothing() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rce.protocol.assembler import PLACE_BYTES
 from rce.protocol.exceptions import MessageError
 from rce.protocol.large import read_large
-from rce.protocol.messages import DataMessage
+from rce.protocol.messages import NO_ID, DataMessage
 from rce.protocol.reading import parse_json
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce.protocol.weight import Address, check_elements, find_address, is_light, memory_of, utf8_in_steps
@@ -48,6 +48,35 @@ def test_what_is_light(text: bytes, *, light: bool) -> None:
 def test_the_address_is_found_before_or_after_the_message(*, msg_first: bool) -> None:
     text = data_message({"iTag": "no", "type": "a/B", "data": "x" * 10_000}, msg_first=msg_first)
     assert find_address(text) == Address("tag", STRING, "7")
+
+
+@pytest.mark.parametrize(
+    ("written", "id_"),
+    [
+        ('"7"', "7"),
+        ("7", "7"),
+        ("7 ", "7"),
+        ("7.0", "7"),
+        ("-1", "-1"),
+        ('"a,b"', "a,b"),
+        ('"x}y"', "x}y"),
+        (r'"a\"\u00e9"', 'a"\u00e9'),
+        ('"nil"', NO_ID),
+        ("1.5", NO_ID),
+        ("1e999", NO_ID),
+        ("1.2.3", NO_ID),
+        ("null", NO_ID),
+        ('""', NO_ID),
+        (json.dumps("x" * 255), "x" * 255),
+    ],
+)
+@pytest.mark.parametrize("is_first", [True, False])
+def test_the_id_of_a_large_message_is_read_as_json(written: str, id_: str, *, is_first: bool) -> None:
+    """A refusal names the call by it, so that its caller learns of the end."""
+    ends = [f'"msgID": {written}', f'"msg": {json.dumps("x" * 10_000)}']
+    fields = ['"iTag": "tag"', '"type": "a/B"', *(ends if is_first else ends[::-1])]
+    found = find_address(f'{{"type": "DM", "data": {{{", ".join(fields)}}}}}'.encode())
+    assert found == Address("tag", "a/B", id_)
 
 
 def test_a_text_without_a_tag_at_its_ends_has_no_address() -> None:
