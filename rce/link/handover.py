@@ -102,6 +102,8 @@ class HandoverReceiver:
         self._adopt = adopt
         self._on_end = on_end
         self._scope = BackgroundTasks()
+        self._begun: set[socket.socket] = set()
+        """Connections whose task has not run yet; it may be cancelled before."""
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(sock, self._read)
         self._open = True
@@ -110,6 +112,9 @@ class HandoverReceiver:
         """Stop taking connections."""
         self._stop()
         await self._scope.close()
+        for connection in self._begun:
+            connection.close()
+        self._begun.clear()
 
     def _stop(self) -> None:
         if self._open:
@@ -132,11 +137,19 @@ class HandoverReceiver:
                 if self._on_end is not None:
                     self._on_end()
             for descriptor in descriptors:
-                self._scope.spawn(self._take(descriptor, received), name="handed-over connection")
+                try:
+                    connection = socket.socket(fileno=descriptor)
+                except OSError as error:
+                    _log.info("what was handed over is not a connection: %s", error)
+                    os.close(descriptor)
+                    continue
+                self._begun.add(connection)
+                self._scope.spawn(self._take(connection, received), name="handed-over connection")
 
-    async def _take(self, descriptor: int, received: bytes) -> None:
+    async def _take(self, connection: socket.socket, received: bytes) -> None:
+        self._begun.discard(connection)
         try:
-            await self._adopt(socket.socket(fileno=descriptor), received)
+            await self._adopt(connection, received)
         except (OSError, ValueError) as error:
             _log.info("a handed-over connection is of no use: %s", error)
 

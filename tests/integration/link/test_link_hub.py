@@ -7,6 +7,7 @@ import contextlib
 import os
 import socket
 import stat
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -20,8 +21,6 @@ from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.link.handshake import encode_hello
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from .conftest import Rig
 
 TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 1.0, jitter=0.5))
@@ -156,6 +155,26 @@ async def test_many_connections_are_handed_over_in_a_burst() -> None:
         writer.close()
     await acceptor.close()
     await receiver.close()
+    sender.close()
+
+
+async def test_what_was_just_handed_over_is_closed_with_the_receiver() -> None:
+    """Nothing has taken it yet; what is no connection is left alone."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+    async def adopt(sock: socket.socket, received: bytes) -> None:
+        pytest.fail(f"it was adopted with {received!r}")
+
+    sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, adopt)
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with near, far, Path(os.devnull).open() as file:
+        await sender.send(file, b"no connection")  # type: ignore[arg-type]
+        await sender.send(far, b"hello")
+        far.close()
+        receiver._read()
+        await receiver.close()
+        assert near.recv(1) == b""
     sender.close()
 
 
