@@ -13,7 +13,18 @@ from rce.own_process import EndSignals, end_signals
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.catalogue import experiments_of
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
-from rce_fleet.experiments.folders import RUNS, check_same, former_of, go_on, new_folder, runs_of, used_alone
+from rce_fleet.experiments.folders import (
+    ROBOTS,
+    RUNS,
+    SEED,
+    check_same,
+    former_of,
+    go_on,
+    known_options,
+    new_folder,
+    runs_of,
+    used_alone,
+)
 from rce_fleet.experiments.ownership import measuring, sweep
 from rce_fleet.experiments.report import make_report, read_second
 from rce_fleet.experiments.results import error_text
@@ -46,11 +57,12 @@ def experiment(
     ] = None,
     runs: Annotated[
         int | None,
-        typer.Option(
-            min=1, help=f"Runs of each set-up that count [{RUNS}; with --resume, as many as before]."
-        ),
+        typer.Option(min=1, help="Runs of each set-up that count.", show_default=str(RUNS)),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of runs and of random choices.")] = 1,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Seed of the order of runs and of random choices.", show_default=str(SEED)),
+    ] = None,
     *,
     quick: Annotated[
         bool, typer.Option("--quick", help="One short run of a few conditions, to see that all works.")
@@ -59,16 +71,23 @@ def experiment(
         bool, typer.Option("--plan", help="Print what would run and how long it takes; run nothing.")
     ] = False,
     resume: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Go on where the run in this folder ended.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Go on where the run in this folder ended, with its options."),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for the raw data.", show_default="experiment-TIME"),
     ] = None,
-    robots: Annotated[int, typer.Option(min=1, max=20, help="Robots, where an experiment has no own.")] = 5,
-    systems: Annotated[str, typer.Option(metavar="NAME,...", help="Systems that are compared.")] = ",".join(
-        PAPER_SYSTEMS
-    ),
+    robots: Annotated[
+        int | None,
+        typer.Option(min=1, max=20, help="Robots, where an experiment has no own.", show_default=str(ROBOTS)),
+    ] = None,
+    systems: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...", help="Systems that are compared.", show_default=",".join(PAPER_SYSTEMS)
+        ),
+    ] = None,
     software: Annotated[
         str | None,
         typer.Option(
@@ -103,10 +122,17 @@ def experiment(
         if name == MAKE_PAGE:
             _report(folders or [], page, second or [])
             return
-        options = _options(systems, software, robots, quick=quick)
         experiments = _experiments(name, folders)
         former = _former(resume, output)
-        planned = Plan(experiments, options, 1 if quick else runs or runs_of(former), seed)
+        known = known_options(former)
+        options = _options(
+            known.systems if systems is None else systems,
+            known.software if software is None else software,
+            robots or known.robots,
+            quick=quick or known.quick,
+        )
+        count = 1 if options.quick else runs or runs_of(former)
+        planned = Plan(experiments, options, count, known.seed if seed is None else seed)
         for line in planned.left_out():
             typer.echo(line)
         if resume is not None:
@@ -199,8 +225,8 @@ async def _run(runner: Runner) -> None:
                 loop.remove_signal_handler(number)
 
 
-def _options(systems: str, software: str | None, robots: int, *, quick: bool) -> Options:
-    chosen = _names(systems, "--systems")
+def _options(systems: str | None, software: str | None, robots: int, *, quick: bool) -> Options:
+    chosen = PAPER_SYSTEMS if systems is None else _names(systems, "--systems")
     for name in chosen:
         system_of(name)
     if software is None:

@@ -8,6 +8,7 @@ import fcntl
 import json
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +22,19 @@ if TYPE_CHECKING:
 
     from rce_fleet.experiments.runner import Plan
 
-RUNS = 10
-"""Runs of each set-up that count, if neither the command nor the folder says."""
+RUNS, SEED, ROBOTS = 10, 1, 5
+"""Runs of each set-up that count, the seed, and robots, if neither the command nor the folder says."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """The options with which a folder's raw data were begun, as a command gives them; None: not known."""
+
+    seed: int = SEED
+    robots: int = ROBOTS
+    systems: str | None = None
+    software: str | None = None
+    quick: bool = False
 
 
 def new_folder(planned: Plan, output: Path | None) -> Path:
@@ -111,6 +123,24 @@ def runs_of(former: dict[str, Any]) -> int:
     """
     found = former.get("runs", RUNS)
     return found if isinstance(found, int) and found > 0 else RUNS
+
+
+def known_options(former: dict[str, Any]) -> Known:
+    """Return the options of a command that goes on, as far as it gives none itself.
+
+    Args:
+        former: What the raw data so far depend on; empty: there are none. What it says wrongly is left to
+            :func:`check_same`.
+    """
+    found = former.get("options", {})
+    seed, robots = former.get("seed"), found.get("robots")
+    names = {key: found.get(key) for key in ("systems", "software")}
+    return Known(
+        seed=seed if isinstance(seed, int) else SEED,
+        robots=robots if isinstance(robots, int) else ROBOTS,
+        quick=found.get("quick") is True,
+        **{key: ",".join(map(str, value)) for key, value in names.items() if isinstance(value, list)},
+    )
 
 
 def check_same(folder: Path, former: dict[str, Any], planned: Plan) -> None:

@@ -55,6 +55,19 @@ def test_as_many_runs_are_made_as_were_begun(data: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_command_that_goes_on_needs_no_option_again(tmp_path: Path) -> None:
+    """It is what is printed after Ctrl-C; an option that is given must be the same."""
+    options = _options(SYSTEMS, "rce", 3, quick=True)
+    environment.write(tmp_path, environment.describe(options, seed=4, runs=1))
+    again = ["laser", "--plan", "--resume", str(tmp_path)]
+    shown = CliRunner().invoke(app, again)
+    assert shown.exit_code == 0, shown.output
+    for given in (["--seed", "1"], ["--robots", "1"], ["--systems", "cloud"], ["--software", "ros"]):
+        refused = CliRunner().invoke(app, [*again, *given])
+        assert (refused.exit_code, "data of both cannot be in one table" in refused.output) == (1, True)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "text"),
     [
