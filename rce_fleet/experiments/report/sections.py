@@ -193,8 +193,8 @@ def limits() -> str:
     return f"""\
 - Machines are network namespaces of one computer and share its cores: where they need more than there is,
   they slow each other down. Ratios carry over to other computers, absolute numbers do not.
-- The link is emulated: rate, delay and loss are those of a wireless LAN, but radio channels, roaming and
-  other senders are missing.
+- The link is emulated: rate, delay and jitter are those of a wireless LAN. It loses no frame, as such a LAN
+  sends again what was lost; radio channels, roaming and other senders are missing.
 - The robots are simulated, and the scans and images are made by programs.
 - The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
   verdict is about the versions above.
