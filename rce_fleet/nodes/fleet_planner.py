@@ -43,7 +43,7 @@ from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
 from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters, unknown_parameters
 from rce_fleet.nodes.grid_topics import GridTopics
-from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
+from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots, uptime
 from rce_fleet.nodes.plan_worker import PlanWorker
 from rce_fleet.nodes.planner_parameters import KNOWN, read_lane_graph, read_settings
 from rce_fleet.nodes.pose_publisher import PosePublisher
@@ -160,7 +160,10 @@ class PlannerNode:
                 expected[found[1]] = ()
         if self._known is not None:
             try:
-                expected |= self._known.read(self._planner.state.grid, time.time())
+                robots, remark = self._known.read(self._planner.state.grid, uptime())
+                expected |= robots
+                if remark:
+                    self._node.log.warning("%s", remark)
             except (OSError, ValueError) as error:
                 self._node.log.warning("robots of an earlier planner are not known: %s", error)
         if expected:
@@ -169,11 +172,11 @@ class PlannerNode:
     async def _keep_known(self) -> None:
         """Write the robots and their cells, if they changed, beside the planner's work."""
         while self._known is not None and not self.successor and await self._node.sleep(KEEP_EVERY):
-            content = self._known.content(self._planner.state, time.time())
+            content = self._known.content(self._planner.state, uptime())
             if content is None:
                 continue
             try:
-                await asyncio.to_thread(self._known.write, content, time.time())
+                await asyncio.to_thread(self._known.write, content, uptime())
             except OSError as error:
                 self._throttled_log.warn("known", f"robots cannot be kept for the next planner: {error}")
 
