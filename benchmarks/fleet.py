@@ -29,6 +29,7 @@ from rce.ros.types import Time, TypeRegistry
 from rce_fleet.compiled import is_available
 from rce_fleet.coordination.events import (
     BlockedChanged,
+    CellsIgnored,
     Event,
     GoalSet,
     MakePlan,
@@ -85,7 +86,7 @@ class Fleet:
                     self.requests.append(request)
                 case SendCells(robot, revision, cells):
                     self.revisions[robot] = revision, cells
-                case SendCancel() | Reply() | BlockedChanged():
+                case SendCancel() | Reply() | BlockedChanged() | CellsIgnored():
                     pass
 
     def pose(self, robot: str) -> PoseSeen:

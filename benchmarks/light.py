@@ -21,6 +21,7 @@ import numpy as np
 from benchmarks.figures import Results, own_memory, show
 from rce_fleet.coordination.events import (
     BlockedChanged,
+    CellsIgnored,
     Event,
     GoalSet,
     MakePlan,
@@ -166,7 +167,7 @@ class Fleet:
                     row = self.robots.row(robot)
                     assert row is not None
                     self._follow(row, self.clients[row].cancel(self.robots.time))
-                case Reply() | BlockedChanged():
+                case Reply() | BlockedChanged() | CellsIgnored():
                     pass
                 case _:
                     assert_never(instruction)

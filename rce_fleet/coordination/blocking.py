@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import hypot
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     CellFreed,
+    CellsIgnored,
     ObstacleGone,
     ObstacleSeen,
     Reply,
     ZonesSet,
 )
+from rce_fleet.coordination.localization import fault_of_place
 from rce_fleet.coordination.refusals import describe_zone, refuse_block
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.zones import ZoneKind
@@ -46,22 +49,46 @@ class CellBlocking:
     # What robots see
 
     def take_obstacle(self, event: ObstacleSeen) -> None:
-        """Block the cells that a robot found blocked."""
+        """Block the cells that a robot found blocked, if it can see them from where it is."""
         state = self._state
-        for cell in event.cells:
-            owner = state.ledger.owner(cell) if cell in state.grid else None
+        for cell in self._believable(event):
+            owner = state.ledger.owner(cell)
             standing = cell in state.ledger.route(event.robot)[:1]
             # In cells of other robots the sensor has seen these robots.
-            if cell not in state.grid or owner not in (None, event.robot) or standing:
+            if owner not in (None, event.robot) or standing:
                 continue
             if not state.is_shut(cell):
                 self._shut(cell)
                 state.sensed.add(cell)
 
     def take_gone(self, event: ObstacleGone) -> None:
-        """Free those of the cells that sensors found blocked."""
-        for cell in event.cells:
+        """Free those of the cells that sensors found blocked, if the robot can see them from where it is."""
+        for cell in self._believable(event):
             self.take_robot(cell)
+
+    def _believable(self, event: ObstacleSeen | ObstacleGone) -> list[int]:
+        """Return the cells of a report that are on the grid and that its robot can see.
+
+        A robot that is not where its pose says compares its scan with other walls.
+        """
+        state, settings = self._state, self._dispatcher.settings
+        record = state.robots.get(event.robot)
+        fault = fault_of_place(record, settings)
+        cells = [cell for cell in event.cells if cell in state.grid]
+        if record is None or fault:
+            self._dispatcher.out.append(CellsIgnored(event.robot, fault))
+            return []
+        reach = settings.obstacle_reach + state.grid.cell_size
+        near = []
+        for cell in cells:
+            x, y = state.grid.centre(cell)
+            if hypot(x - record.x, y - record.y) <= reach:
+                near.append(cell)
+        if len(near) < len(cells):
+            far = min(set(cells).difference(near))
+            reason = f"cell {far} is farther from it than {settings.obstacle_reach:g} m (obstacle_reach)"
+            self._dispatcher.out.append(CellsIgnored(event.robot, reason))
+        return near
 
     def take_robot(self, cell: int) -> None:
         """Free a cell that sensors found blocked and that a robot is in: they saw that robot."""

@@ -231,4 +231,17 @@ class MakePlan:
     request: PlanRequest
 
 
-Instruction = SendCells | SendCancel | Reply | BlockedChanged | MakePlan
+@dataclass(frozen=True, slots=True)
+class CellsIgnored:
+    """A robot reported cells that cannot be believed.
+
+    Attributes:
+        robot: Its name.
+        reason: Why they are ignored, for people.
+    """
+
+    robot: str
+    reason: str
+
+
+Instruction = SendCells | SendCancel | Reply | BlockedChanged | MakePlan | CellsIgnored

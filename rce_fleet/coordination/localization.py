@@ -1,4 +1,4 @@
-"""Whether a robot knows where it is, by the covariance of its poses. Pure.
+"""Whether a robot knows where it is, by its poses and their covariance. Pure.
 
 The covariance is what localization says of itself: of the particles of ``amcl``. Between the limits for
 "lost" and for "found" a robot stays what it is, so that it does not change from one pose to the next.
@@ -6,7 +6,7 @@ The covariance is what localization says of itself: of the particles of ``amcl``
 
 from __future__ import annotations
 
-from math import degrees
+from math import degrees, isnan
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -37,4 +37,20 @@ def is_lost(record: RobotRecord, pose: PoseSeen, settings: FleetSettings) -> str
         return "" if found else record.lost
     if spread > settings.lost_spread or yaw_spread > settings.lost_yaw:
         return f"its pose is uncertain by {spread:.1f} m and {degrees(yaw_spread):.0f} degrees: {ADVICE}"
+    return ""
+
+
+def fault_of_place(record: RobotRecord | None, settings: FleetSettings) -> str:
+    """Return why it is not known where a robot is, and so which cells its sensors see; empty: it is known.
+
+    Args:
+        record: The robot; None: the planner does not know it.
+        settings: The limits.
+    """
+    if record is None or isnan(record.x):
+        return "it has sent no pose"
+    if record.lost:
+        return record.lost
+    if record.doubted or not record.is_steady(settings):
+        return "its pose jumped farther than it can drive"
     return ""

@@ -59,6 +59,8 @@ class FleetSettings:
         jump_distance: A pose farther from the one before than this and the way at top speed cannot be true.
         lost_spread: A robot is lost when the standard deviation of its place is larger than this, metres.
         lost_yaw: The same for its heading, radians.
+        obstacle_reach: Cells that a robot reports, blocked or free, and that are farther from it than this
+            are ignored, metres; a cell's size is added.
         jump_settle_time: A robot whose pose jumped keeps its cells for this time of steady poses.
         patience: A robot that has stood so long, with a path to its goal and no cell to drive to, is the
             first in the next plan for all; see :mod:`rce_fleet.coordination.starvation`.
@@ -98,6 +100,7 @@ class FleetSettings:
     jump_settle_time: float = 3.0
     lost_spread: float = 1.0
     lost_yaw: float = 1.0
+    obstacle_reach: float = 10.0
     patience: float = 30.0
     visits_per_step: int = 4_000
     robots_per_step: int = 200

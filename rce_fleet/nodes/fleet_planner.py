@@ -21,6 +21,7 @@ from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     CellFreed,
+    CellsIgnored,
     Event,
     GoalSet,
     Instruction,
@@ -299,6 +300,9 @@ class PlannerNode:
                     self._grid.change(cells)
                 case MakePlan(request):
                     self._requests.put_nowait((self._planner, request))
+                case CellsIgnored(robot, reason):
+                    text = f"cells that {robot} reports blocked or free are ignored: {reason}"
+                    self._throttled_log.warn(f"cells of {robot}", text)
                 case Reply():
                     pass  # for the caller
                 case _:

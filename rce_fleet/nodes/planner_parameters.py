@@ -23,8 +23,7 @@ KNOWN = GRID_PARAMETERS | frozenset(
     {
         *("blocked", "lanes", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
-        "improve_seconds",
-        "learn_congestion",
+        *("improve_seconds", "learn_congestion", "obstacle_reach"),
     }
 )
 """Names of all parameters."""
@@ -48,6 +47,7 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         pose_only_after=read_number(values, "pose_only_after", default.pose_only_after),
         lost_spread=read_number(values, "lost_spread", default.lost_spread),
         lost_yaw=read_number(values, "lost_yaw", default.lost_yaw),
+        obstacle_reach=read_number(values, "obstacle_reach", default.obstacle_reach),
         plan_timeout=read_number(values, "plan_timeout", default.plan_timeout),
         planner=str(values.get("planner", default.planner)),
         resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
@@ -56,7 +56,8 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         learn_congestion=bool(values.get("learn_congestion", default.learn_congestion)),
         improve_seconds=read_number(values, "improve_seconds", IMPROVE_SECONDS),
     )
-    for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw", "plan_timeout"):
+    above_zero = ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw", "obstacle_reach")
+    for name in (*above_zero, "plan_timeout"):
         if getattr(settings, name) <= 0:
             raise ValueError(f"the parameter {name} must be above 0, not {getattr(settings, name):g}")
     if settings.improve_seconds < 0:

@@ -9,10 +9,12 @@ from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     CellFreed,
+    CellsIgnored,
     Instruction,
     ObstacleGone,
     ObstacleSeen,
     PoseSeen,
+    ReportSeen,
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
@@ -39,7 +41,41 @@ def test_a_sensed_cell_is_freed_when_it_is_seen_free(planner: FleetPlanner) -> N
 
 def test_another_robot_may_see_that_a_cell_is_free(planner: FleetPlanner) -> None:
     planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
+    planner.handle(PoseSeen("Robot2", 3.5, 3.5, 0.0), 1.5)
     assert blocked(planner.handle(ObstacleGone("Robot2", (5,)), 2.0)) == [()]
+
+
+def ignored(planner: FleetPlanner, robot: str, cells: tuple[int, ...], now: float) -> str:
+    """Report cells as blocked and free; return why both are ignored."""
+    before = set(planner.state.blocked)
+    out = planner.handle(ObstacleSeen(robot, cells), now) + planner.handle(ObstacleGone(robot, (5,)), now)
+    assert planner.state.blocked == before
+    planner.validate()
+    reasons = [one.reason for one in out if isinstance(one, CellsIgnored) and one.robot == robot]
+    assert reasons[0] == reasons[-1]
+    return reasons[0]
+
+
+def test_cells_of_robots_without_a_known_place_are_ignored(planner: FleetPlanner) -> None:
+    """They would close aisles for the whole fleet."""
+    planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
+    assert ignored(planner, "Robot9", (6,), 1.0) == "it has sent no pose"
+    planner.handle(ReportSeen("Robot2", ClientReport(0, ClientState.IDLE)), 1.0)
+    assert ignored(planner, "Robot2", (6,), 1.0) == "it has sent no pose"
+    planner.handle(PoseSeen("Robot2", 3.5, 3.5, 0.0, 2.5, 0.1), 2.0)
+    assert "its pose is uncertain by 2.5 m" in ignored(planner, "Robot2", (6,), 2.0)
+    planner.handle(PoseSeen("Robot1", 200.0, 0.5, 0.0), 2.0)
+    assert "jumped" in ignored(planner, "Robot1", (6,), 2.0)
+
+
+def test_cells_that_a_robot_cannot_see_are_ignored() -> None:
+    planner = FleetPlanner(GridMap(20, 20))
+    planner.handle(PoseSeen("Robot1", 0.5, 0.5, 0.0), 0.0)
+    out = planner.handle(ObstacleSeen("Robot1", (10, 12, 399, 400)), 1.0)
+    assert planner.state.blocked == {10}
+    why = [one.reason for one in out if isinstance(one, CellsIgnored)]
+    assert why == ["cell 12 is farther from it than 10 m (obstacle_reach)"]
+    planner.validate()
 
 
 def test_a_cell_that_a_robot_is_in_held_that_robot(planner: FleetPlanner) -> None:

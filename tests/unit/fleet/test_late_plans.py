@@ -9,6 +9,7 @@ import pytest
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
+    CellsIgnored,
     Event,
     GoalSet,
     Instruction,
@@ -53,7 +54,7 @@ class PlannerHarness:
                     self.requests.append(request)
                 case SendCells(robot, revision, cells):
                     self.sent[robot], self.revisions[robot] = cells, revision
-                case SendCancel() | Reply() | BlockedChanged():
+                case SendCancel() | Reply() | BlockedChanged() | CellsIgnored():
                     pass
         self.planner.validate()
         return done
