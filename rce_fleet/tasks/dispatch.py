@@ -358,7 +358,8 @@ class Dispatcher:
         self.chargers.update(idle, book.places.chargers, taken)
         used = {*book.places.chargers}.union(book.used_cells())
         used |= full_zones(book.zones.values(), facts, used)
-        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
+        own_zones = [zone for zone in book.zones.values() if zone.kind == "blocked" and zone.robots]
+        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys(), own_zones)
         self._parking.update(now, idle, self.chargers.charging, facts, cells)
 
     def _nearest(self, robot: RobotFacts, cells: Iterable[int]) -> int | None:

@@ -32,15 +32,21 @@ class ParkingCells:
         parking: The parking places; empty: there are none.
         used: Cells of open tasks, chargers, and full zones with either.
         taken: Cells to which robots go now for tasks, or where they act.
+        own_zones: Zones that are blocked for single robots.
     """
 
     parking: AbstractSet[int]
     used: AbstractSet[int]
     taken: AbstractSet[int]
+    own_zones: Collection[Zone] = ()
 
     def is_in_way(self, cell: int) -> bool:
         """Return whether an idle robot in a cell has to go elsewhere."""
         return cell in self.taken or (cell not in self.parking if self.parking else cell in self.used)
+
+    def closed_to(self, robot: str) -> set[int]:
+        """Return the cells that only zones of its own close to a robot."""
+        return {cell for zone in self.own_zones if zone.applies_to(robot) for cell in zone.cells}
 
 
 class Parking:
@@ -61,6 +67,8 @@ class Parking:
         self._idle_since: dict[str, float] = {}
         self._search_at: dict[str, float] = {}
         """When a place is searched again for a robot that found none."""
+        self._refused: dict[str, set[int]] = {}
+        """Places that were found for a robot and that it cannot reach."""
 
     def update(
         self,
@@ -98,6 +106,8 @@ class Parking:
             and robot.cell is not None
             and cells.is_in_way(robot.cell)
         ]
+        moving = {robot.id for robot in moves}
+        self._refused = {name: found for name, found in self._refused.items() if name in moving}
         if not moves or facts.grid is None:
             return
         avoided = {robot.cell for robot in facts.robots.values() if robot.cell is not None}
@@ -110,9 +120,15 @@ class Parking:
             may_search = searches < _SEARCHES and robot.id not in self._search_at
             if place is None and may_search and robot.cell is not None and robot.cell in cells.used:
                 searches += 1
-                place = place_to_wait(facts.grid, facts.shut, robot.cell, avoided)
+                refused = self._refused.setdefault(robot.id, set())
+                closed = cells.closed_to(robot.id)
+                place = place_to_wait(facts.grid, facts.shut, robot.cell, avoided | refused, closed)
                 if place is None:
                     self._search_at[robot.id] = now + _SEARCH_AGAIN_S
+                    refused.clear()
+                elif self._ways.nearest(robot, (place,)) is None:
+                    refused.add(place)  # the next step finds another one
+                    place = None
             if place is None:
                 continue
             self.cells[robot.id] = place
@@ -159,14 +175,21 @@ def keeps_clear(grid: GridMap, shut: Collection[int], cell: int) -> bool:
     return gaps - lone_corners <= 1
 
 
-def place_to_wait(grid: GridMap, shut: Collection[int], start: int, avoided: Collection[int]) -> int | None:
+def place_to_wait(
+    grid: GridMap,
+    shut: Collection[int],
+    start: int,
+    avoided: Collection[int],
+    closed: Collection[int] = (),
+) -> int | None:
     """Return the nearest cell where a robot hinders no other one; None if there is none near.
 
     Args:
         grid: The map.
-        shut: Cells that cannot be entered.
+        shut: Cells that no robot can enter.
         start: The robot's cell.
         avoided: Cells that tasks, chargers or other robots use.
+        closed: More cells that this robot cannot enter.
     """
     seen, queue = {start}, deque([start])
     while queue and len(seen) < _LOOK_AT_MOST:
@@ -174,7 +197,7 @@ def place_to_wait(grid: GridMap, shut: Collection[int], start: int, avoided: Col
         if cell not in avoided and cell not in shut and keeps_clear(grid, shut, cell):
             return cell
         for other in grid.around(cell):
-            if other not in seen and other not in shut:
+            if other not in seen and other not in shut and other not in closed:
                 seen.add(other)
                 queue.append(other)
     return None

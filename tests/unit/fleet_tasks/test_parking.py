@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -29,6 +30,22 @@ def test_an_idle_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
     floor.go(20, earliest_start=floor.now + 1e6)
     floor.run(20)
     assert robot.cell != 20
+
+
+@pytest.mark.parametrize("closes", ["cells", "edges"])
+def test_an_idle_robot_waits_where_no_own_zone_bars_it(floor: Floor, closes: str) -> None:
+    """The planner would refuse the nearest cell in each step, and the robot stay in the way."""
+    cells = (11, 12, 13, 19, 21, 27)
+    edges = tuple((beside, cell) for cell in (12, 19, 21) for beside in floor.grid.around(cell))
+    zone = Zone("own", "blocked", cells) if closes == "cells" else Zone("own", "blocked", (), edges=edges)
+    floor.book.emit(replace(zone, robots=("Robot1",)), "zone", floor.now)
+    floor.add("Robot1", 20)
+    floor.go(20, earliest_start=floor.now + 1e6)
+    goals = set()
+    for _ in range(15):
+        floor.run(1)
+        goals |= {goal for goal in floor.dispatcher.goals().values() if goal is not None}
+    assert goals == {28}
 
 
 @pytest.mark.parametrize(
@@ -59,9 +76,9 @@ def test_robots_without_a_place_to_wait_hold_no_step_up(monkeypatch: pytest.Monk
     searched: list[int] = []
     search = parking_module.place_to_wait
 
-    def noted(grid: GridMap, shut: Any, start: int, avoided: Any) -> int | None:
+    def noted(grid: GridMap, shut: Any, start: int, avoided: Any, closed: Any) -> int | None:
         searched.append(start)
-        return search(grid, shut, start, avoided)
+        return search(grid, shut, start, avoided, closed)
 
     monkeypatch.setattr(parking_module, "place_to_wait", noted)
     counts = []
