@@ -110,9 +110,13 @@ class FleetFacts:
             now: Seconds since 1970, after the step.
         """
         self.clock_steps = [*self.clock_steps[1 - MOST_STEPS :], (now - seconds, seconds)]
+        before = now - seconds
         for robot in self.robots.values():
-            robot.moved_at += seconds
-            robot.away_since += seconds
+            # What was noted after the step of the clock has the new time already.
+            if robot.moved_at <= before:
+                robot.moved_at += seconds
+            if robot.away_since <= before:
+                robot.away_since += seconds
 
     def elapsed(self, since: float, now: float) -> float:
         """Return the seconds from one time to another, without steps of the clock."""

@@ -108,6 +108,28 @@ async def test_a_forward_step_makes_no_robot_stuck(machine: Machine, tmp_path: P
     await manager.close()
 
 
+@pytest.mark.parametrize("is_before", [True, False])
+async def test_a_robot_that_falls_silent_at_a_forward_step(
+    machine: Machine, tmp_path: Path, is_before: bool
+) -> None:
+    """The planner says so just before the clock is set, or before the manager has noticed that it was."""
+    manager = FleetManager(
+        Journal(tmp_path / "j.sqlite"), Planner(), TaskRules(), logging.getLogger("manager")
+    )
+    robot = manager.facts.robots["Robot1"] = RobotFacts("Robot1", "silent", cell=0)
+    for jump in (0.0, DAY):
+        machine.wall += jump
+        if is_before is (jump == 0.0):
+            robot.moved_at = robot.away_since = manager.clock()
+    machine.wait(0.1)
+    await manager.step()
+    machine.wait(20.0)
+    await manager.step()
+    assert manager.clock() - robot.away_since == pytest.approx(20.1, abs=0.11)
+    assert manager.clock() - robot.moved_at == pytest.approx(20.1, abs=0.11)
+    await manager.close()
+
+
 async def test_a_forward_step_is_no_time_of_robots(machine: Machine, tmp_path: Path) -> None:
     """The utilization of the next day would be that of the moment at which the clock was set."""
     journal = Journal(tmp_path / "j.sqlite")
