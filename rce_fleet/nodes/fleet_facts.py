@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Any
 
 from rce_fleet.coordination.following import ChangeFollower
@@ -16,6 +16,8 @@ from rce_fleet.tasks.records import TURNED_BY, PlannerRun
 _DETAILS = re.compile(r"[^(]*\((.*)\)")
 """A mode as a reason, with what a person gave as reason: ``paused (visitors, by anna)``."""
 
+SLACK = 0.05
+"""So far beyond 0 .. 1 a share may be: of a battery that was just charged, or is empty."""
 FULL = 4
 """``POWER_SUPPLY_STATUS_FULL`` of ``sensor_msgs/BatteryState``."""
 
@@ -119,10 +121,10 @@ class FactKeeper:
             self._apply(message, now)
         self._facts.is_current = not self._follower.is_behind
 
-    def take_battery(
-        self, robot: str, percentage: float, charge: float, capacity: float, status: int
-    ) -> None:
-        """Take over a ``sensor_msgs/BatteryState``.
+    def take_battery(self, robot: str, percentage: float, charge: float, capacity: float, status: int) -> str:
+        """Take over a ``sensor_msgs/BatteryState``; return what is wrong with it, or an empty text.
+
+        A percentage that is not a share does not count; charge and capacity may tell the level.
 
         Args:
             robot: Whose battery.
@@ -131,14 +133,17 @@ class FactKeeper:
             capacity: Ampere hours of the full battery.
             status: ``power_supply_status``; 4: it is full, also if it is worn and holds less than new.
         """
-        share = percentage
-        if not isfinite(share) and capacity > 0:
-            share = charge / capacity
+        is_share = -SLACK <= percentage <= 1.0 + SLACK
+        share = percentage if is_share else charge / capacity if capacity > 0 else nan
         level = min(1.0, max(0.0, share)) if isfinite(share) else None
         self._batteries[robot] = level = 1.0 if status == FULL else level
         known = self._facts.robots.get(robot)
         if known is not None:
             known.battery = level
+        if is_share or not isfinite(percentage):
+            return ""
+        instead = "charge and capacity count" if level is not None else "the level counts as not known"
+        return f"percentage is {percentage:g}, not a share of 0 .. 1: {instead}"
 
     # Inner
 

@@ -132,6 +132,8 @@ class ManagerNode:
         self._journal = journal
         self._events: Publisher
         self._batteries: set[str] = set()
+        self._wrong_batteries: set[str] = set()
+        """Robots whose batteries say what cannot be: each is warned of once."""
         self._heard_at = 0.0
         self._state_needed = asyncio.Event()
         self._requested: deque[tuple[float, frozenset[int]]] = deque(maxlen=MOST_LISTS)
@@ -310,9 +312,12 @@ class ManagerNode:
     async def _follow_battery(self, robot: str) -> None:
         def take(message: Message) -> None:
             capacity = message.capacity if message.capacity > 0 else message.design_capacity
-            self._facts.take_battery(
+            fault = self._facts.take_battery(
                 robot, message.percentage, message.charge, capacity, message.power_supply_status
             )
+            if fault and robot not in self._wrong_batteries:
+                self._node.log.warning("/%s/battery_state: %s", robot, fault)
+            (self._wrong_batteries.add if fault else self._wrong_batteries.discard)(robot)
 
         await self._node.subscribe(f"/{robot}/battery_state", "sensor_msgs/BatteryState", take)
         self._batteries.add(robot)

@@ -63,6 +63,8 @@ def test_lanes_come_from_the_planners_state() -> None:
         (nan, 20.0, FULL, 1.0),
         (0.93, 0.0, FULL, 1.0),
         (nan, 0.0, 1, None),
+        (1.04, 0.0, 1, 1.0),
+        (-0.02, 0.0, 1, 0.0),
     ],
 )
 def test_a_battery_is_full_when_it_says_so(
@@ -70,8 +72,18 @@ def test_a_battery_is_full_when_it_says_so(
 ) -> None:
     """A worn one holds 16 of 20 ampere hours then."""
     facts = FleetFacts(robots={"Robot1": RobotFacts("Robot1")})
-    FactKeeper(facts).take_battery("Robot1", percentage, 16.0, capacity, status)
+    assert not FactKeeper(facts).take_battery("Robot1", percentage, 16.0, capacity, status)
     assert facts.robots["Robot1"].battery == level
+
+
+@pytest.mark.parametrize("percentage", [12.0, 100.0, -1.0])
+@pytest.mark.parametrize(("capacity", "level"), [(0.0, None), (20.0, 0.8)])
+def test_a_battery_in_percent_is_not_full(percentage: float, capacity: float, level: float | None) -> None:
+    """Its robot would get every task and never charge."""
+    facts = FleetFacts(robots={"Robot1": RobotFacts("Robot1", battery=0.5)})
+    fault = FactKeeper(facts).take_battery("Robot1", percentage, 16.0, capacity, 2)
+    assert facts.robots["Robot1"].battery == level
+    assert f"percentage is {percentage:g}, not a share of 0 .. 1" in fault
 
 
 @pytest.mark.parametrize(
