@@ -104,13 +104,9 @@ class FleetManager:
         self.hand_goals = HandGoals(self.book, self.facts, self.goals)
         last = journal.events(EventQuery(after=self.book.number - 1, limit=1)) if self.book.number else []
         self._wall = WallClock(last[0]["time"] if last else 0.0)
-        if clock is None and self._wall.lead > LEAD_S:
-            log.warning(
-                "the journal is %.0f s ahead of this machine's clock: the fleet's time runs slower until both"
-                " agree; set the machine's clock if it is wrong",
-                self._wall.lead,
-            )
+        self._has_warned_of_lead = False
         self.clock = clock or self._wall
+        self._follow_lead()
         self.statistics = FleetStatistics(self.clock(), (Minute(*row) for row in journal.minutes()))
 
     def _load(self) -> None:
@@ -199,8 +195,21 @@ class FleetManager:
                 return False
         return True
 
+    def _follow_lead(self) -> None:
+        """Have deadlines and starts follow the machine's clock where that is behind the fleet's time."""
+        lead = self.book.lead = self._wall.lead if self.clock is self._wall else 0.0
+        if lead > LEAD_S and not self._has_warned_of_lead:
+            self._log.warning(
+                "the fleet's time is %.0f s ahead of this machine's clock, which was set back, or the journal"
+                " is of a machine that was ahead: deadlines and starts follow the clock, and times of events"
+                " run slower until both agree; set the machine's clock if it is wrong",
+                lead,
+            )
+        self._has_warned_of_lead = lead > LEAD_S
+
     def _follow_clock(self, now: float) -> None:
         """Count no step of the clock as time in which robots did something, or did not."""
+        self._follow_lead()
         step, self._wall.stepped = self._wall.stepped, 0.0
         if step > CLOCK_STEP_S and self.clock is self._wall:
             self._log.warning("the clock of this machine was set %.0f s forward", step)

@@ -22,11 +22,17 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.order import Order
 
 
+CLEAR_LEAD_S = 60.0
+"""With a smaller lead, the fleet's time is good enough as the time at which a recurring task began."""
+
+
 class TaskBook(FleetTables):
     """The tables, and the requests that change tasks.
 
     Attributes:
         grid: The map, for checks of cells; None: not known yet.
+        lead: By how many seconds the fleet's time is ahead of the machine's clock, which deadlines, starts
+            and recurrences follow.
 
     Example:
         ```python
@@ -39,6 +45,11 @@ class TaskBook(FleetTables):
     def __init__(self) -> None:
         super().__init__()
         self.grid: GridMap | None = None
+        self.lead = 0.0
+
+    def clock_time(self, now: float) -> float:
+        """Return what the machine's clock says at a moment of the fleet's time, seconds since 1970."""
+        return now - self.lead
 
     # Requests
 
@@ -65,12 +76,13 @@ class TaskBook(FleetTables):
         if self.grid is not None:
             check_cells(order, self.grid)
         self._check_after(order)
-        start = order.earliest_start if order.earliest_start is not None else now
+        asked = digest(order) if key else ""
+        start = order.earliest_start if order.earliest_start is not None else self.clock_time(now)
         recurs_at = start + order.every if order.every is not None and order.occurrences != 1 else None
+        if recurs_at is not None and self.lead > CLEAR_LEAD_S:
+            order = replace(order, earliest_start=start)  # deadlines of later occurrences are counted from it
         self.last_task += 1
-        task = Task(self.last_task, order, user, key, now, now, recurs_at=recurs_at)
-        if key:
-            task = replace(task, asked=digest(order))
+        task = Task(self.last_task, order, user, key, now, now, recurs_at=recurs_at, asked=asked)
         self.emit(task, "created", now, user=user, text=f"{task.id} was accepted")
         return task
 
@@ -104,7 +116,7 @@ class TaskBook(FleetTables):
             )
         if task.robot and order.robot not in ("", task.robot) and task.is_bound:
             raise TaskRefusedError(f"{task.robot} has the load of {task.id}; another robot cannot take over")
-        recurs_at = _recurs_at(task, order, now)
+        recurs_at = _recurs_at(task, order, self.clock_time(now))
         changed = replace(task, order=order, revision=task.revision + 1, recurs_at=recurs_at, late=False)
         if task.action is None and task.next_stop != changed.next_stop:
             changed = replace(changed, target=None)
@@ -127,7 +139,7 @@ class TaskBook(FleetTables):
         before = task.order
         if order.after != before.after:
             raise TaskRefusedError(f"{task.id} has ended: only its first occurrence comes after other tasks")
-        recurs_at = _recurs_at(task, order, now)
+        recurs_at = _recurs_at(task, order, self.clock_time(now))
         if recurs_at is not None:
             if order.earliest_start not in (None, before.earliest_start):
                 recurs_at = order.earliest_start
@@ -290,7 +302,7 @@ class TaskBook(FleetTables):
         every, due = task.order.every, task.recurs_at
         assert every is not None
         assert due is not None
-        due += every * max(0.0, (now - due) // every)
+        due += every * max(0.0, (self.clock_time(now) - due) // every)
         order = replace(_order_at(task, task.order, due), after=())
         number = task.occurrence + 1
         last = order.occurrences is not None and number >= order.occurrences

@@ -45,10 +45,11 @@ class Conditions:
         """
         self._left = MOST_CHANGED
         self._recur(now)
+        by_clock = self._book.clock_time(now)
         ready = self.ready = []
         for task in self._book.open_tasks():
             order = task.order
-            if order.deadline is not None and now >= order.deadline and (not task.late or _fails(task)):
+            if order.deadline is not None and by_clock >= order.deadline and (not task.late or _fails(task)):
                 if not self._may_change():
                     continue
                 task = self._pass_deadline(task, now)  # noqa: PLW2901 - the same task, changed
@@ -86,10 +87,11 @@ class Conditions:
 
     def _recur(self, now: float) -> None:
         """Create occurrences that are due. One begins only after the one before has ended."""
+        by_clock = self._book.clock_time(now)
         due = [
             task
             for task in self._book.recurring_tasks()
-            if task.recurs_at is not None and task.has_ended and task.recurs_at <= now
+            if task.recurs_at is not None and task.has_ended and task.recurs_at <= by_clock
         ]
         for task in due:
             if not self._may_change():
@@ -123,7 +125,8 @@ class Conditions:
             if before.state is not TaskState.DONE:
                 self._wait(task, f"waits for {name}", now)
                 return False
-        if task.order.earliest_start is not None and now < task.order.earliest_start:
+        start = task.order.earliest_start
+        if start is not None and self._book.clock_time(now) < start:
             self._wait(task, "waits for its earliest start", now)
             return False
         return True

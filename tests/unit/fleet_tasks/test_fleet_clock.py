@@ -16,7 +16,7 @@ from rce_fleet.manager.manager import FleetManager
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.facts import RobotFacts
-from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.order import Action, Order, Stop, WhenLate
 from rce_fleet.tasks.task import TaskState
 
 DAY = 86400.0
@@ -94,7 +94,43 @@ async def test_a_lead_shrinks_over_restarts(
     assert leads[0] == pytest.approx(DAY - 360.0)
     assert all(after < before - 400.0 for before, after in pairwise(leads))
     warned = [record.getMessage() for record in caplog.records if "ahead of this machine" in record.message]
-    assert len(warned) == 3
+    assert len(warned) == 4, "each manager warns once"
+
+
+async def test_a_clock_that_was_once_ahead_ends_no_task(machine: Machine, tmp_path: Path) -> None:
+    """Deadlines, starts and recurrences are the machine's times, also after a restart of the manager."""
+    manager = FleetManager(
+        Journal(tmp_path / "j.sqlite"), Planner(), TaskRules(), logging.getLogger("manager")
+    )
+    machine.wall += DAY
+    manager.clock()
+    machine.wall -= DAY
+    await manager.step()
+    stops, wall = (Stop(Action.GO, (5,)),), machine.wall
+    ends = Order(stops, deadline=wall + 7200, when_late=WhenLate.FAIL)
+    starts = Order(stops, earliest_start=wall + 7200)
+    recurs = Order(stops, deadline=wall + 600, when_late=WhenLate.FAIL, every=3600.0)
+    for order in (ends, starts, recurs):
+        manager.book.create(order, manager.clock())
+    await manager.step()
+    tasks = [manager.book.tasks[number] for number in (1, 2, 3)]
+    assert [task.state for task in tasks] == [TaskState.QUEUED] * 3
+    assert tasks[1].reason == "waits for its earliest start"
+    assert tasks[2].recurs_at == pytest.approx(wall + 3600)
+    await manager.close()
+    manager = FleetManager(
+        Journal(tmp_path / "j.sqlite"), Planner(), TaskRules(), logging.getLogger("manager")
+    )
+    machine.wait(3601.0)
+    await manager.step()
+    await manager.step()
+    states = [task.state for task in manager.book.tasks.values()]
+    assert states == [TaskState.QUEUED, TaskState.QUEUED, TaskState.FAILED, TaskState.QUEUED]
+    assert manager.book.tasks[4].order.deadline == pytest.approx(wall + 3600 + 600)
+    machine.wait(3600.0)
+    await manager.step()
+    assert manager.book.tasks[1].state is TaskState.FAILED
+    await manager.close()
 
 
 async def test_a_forward_step_makes_no_robot_stuck(machine: Machine, tmp_path: Path) -> None:
