@@ -351,7 +351,8 @@ class Dispatcher:
             return self._queues.begins(task, now, facts.robots.get(task.robot), working)
 
         ready, avoided = self._conditions.ready, self._progress.avoid.keys()
-        for choice in self._assigner.choose(ready, free, now, self._open_chargers(), avoided, begins):
+        by_clock = book.clock_time(now)  # by which deadlines are urgent
+        for choice in self._assigner.choose(ready, free, by_clock, self._open_chargers(), avoided, begins):
             self._start(choice.task, choice.robot, now)
             idle.pop(choice.robot, None)
         self._conditions.refresh()
@@ -433,7 +434,7 @@ class Dispatcher:
         self._conditions.refresh()  # Another robot may take what was released.
         if busy := self._queues.busy(now, facts.robots.values()):
             waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
-            waiting = most_urgent_first(waiting, now, self.rules.assignment)
+            waiting = most_urgent_first(waiting, self._book.clock_time(now), self.rules.assignment)
             self._queues.fill(waiting, busy, now, self._progress.avoid.keys())
 
     def _why_not(self, task: Task, name: str, robot: RobotFacts | None) -> str:

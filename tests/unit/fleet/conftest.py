@@ -13,6 +13,7 @@ import pytest
 
 from rce_fleet.coordination.events import (
     BlockedChanged,
+    CellsIgnored,
     Event,
     GoalSet,
     Instruction,
@@ -377,6 +378,8 @@ class SimulatedClients:
             case MakePlan(request):
                 due = self.now + self.rng.choice(self.plan_delays)
                 self._plans.append((due, PlanMade(compute_plan(request))))
+            case CellsIgnored():
+                pass  # a pose was lost: the robot reports them again
 
     def _cells(self, robot: str, revision: int, cells: list[int]) -> None:
         self._instruct(robot, self.clients[robot].take_cells(revision, cells, self.wall))

@@ -11,6 +11,7 @@ import pytest
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
+    CellsIgnored,
     Event,
     GoalSet,
     MakePlan,
@@ -72,7 +73,7 @@ class SimulatedFleet:
                         self.world.add_box(cell)
                 case MakePlan(request):
                     self.plan(PlanMade(compute_plan(request)))
-                case Reply():
+                case Reply() | CellsIgnored():
                     pass
 
     def tell(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:

@@ -133,6 +133,23 @@ async def test_a_clock_that_was_once_ahead_ends_no_task(machine: Machine, tmp_pa
     await manager.close()
 
 
+async def test_a_clock_that_was_once_ahead_changes_no_order(machine: Machine, tmp_path: Path) -> None:
+    """One due next day, and one from before the step, are not more urgent than one of a higher priority."""
+    manager, robot, _ = begin(tmp_path, Stop(Action.GO, (9,)))
+    robot.state = "silent"
+    machine.wall += DAY
+    manager.clock()
+    machine.wall -= DAY
+    stops = (Stop(Action.GO, (9,)),)
+    for order in (Order(stops, deadline=machine.wall + DAY), Order(stops, priority=1)):
+        manager.book.create(order, manager.clock())
+    robot.state = "idle"
+    await wait(machine, manager, 3)
+    begun = [number for number, task in manager.book.tasks.items() if task.state is TaskState.RUNNING]
+    assert begun == [3]
+    await manager.close()
+
+
 async def test_a_forward_step_makes_no_robot_stuck(machine: Machine, tmp_path: Path) -> None:
     manager = FleetManager(
         Journal(tmp_path / "j.sqlite"), Planner(), TaskRules(), logging.getLogger("manager")
