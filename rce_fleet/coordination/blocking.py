@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.zones import Zone
 
 
+DOUBTFUL_S = 30.0
+"""Seconds: what a robot reported in this time before it was found to be lost, it may have seen elsewhere."""
+
+
 class CellBlocking:
     """Blocks and frees cells, and stops the robots concerned.
 
@@ -45,6 +49,8 @@ class CellBlocking:
     def __init__(self, state: FleetState, dispatcher: Dispatcher) -> None:
         self._state = state
         self._dispatcher = dispatcher
+        self._witnesses: dict[int, tuple[str, float]] = {}
+        """Which robot reported a cell as blocked last, and when."""
 
     # What robots see
 
@@ -60,6 +66,15 @@ class CellBlocking:
             if not state.is_shut(cell):
                 self._shut(cell)
                 state.sensed.add(cell)
+            self._witnesses[cell] = event.robot, self._dispatcher.now
+
+    def doubt(self, robot: str) -> None:
+        """Free what a robot reported of late, and no other one since: it was not where its poses said."""
+        since = self._dispatcher.now - DOUBTFUL_S
+        for cell in sorted(self._state.sensed):
+            witness, at = self._witnesses.get(cell, ("", 0.0))
+            if witness == robot and at >= since:
+                self.take_robot(cell)
 
     def take_gone(self, event: ObstacleGone) -> None:
         """Free those of the cells that sensors found blocked, if the robot can see them from where it is."""

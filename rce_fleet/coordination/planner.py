@@ -160,9 +160,7 @@ class FleetPlanner:
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
         self._note_doubt(record)
-        why = is_lost(record, event, self.settings)
-        if why != record.lost:
-            self._modes.set_lost(record, why)
+        self._note_lost(record, event)
         if not record.lost:
             self._clear_cell(event)
         elif record.phase is Phase.STANDING:
@@ -252,8 +250,17 @@ class FleetPlanner:
         """Note where a robot may be after its newest pose: also where it was, if the pose jumped."""
         if record.jumped_at == self._now:
             record.doubted |= self.state.ledger.overlapped(record.id)
+            self._blocking.doubt(record.id)
         elif record.doubted and record.is_steady(self.settings) and not self.state.ledger.length(record.id):
             record.doubted = frozenset()
+
+    def _note_lost(self, record: RobotRecord, pose: PoseSeen) -> None:
+        """Note whether a robot knows where it is, after its newest pose."""
+        why = is_lost(record, pose, self.settings)
+        if why != record.lost:
+            self._modes.set_lost(record, why)
+            if why:
+                self._blocking.doubt(record.id)
 
     def _distrust(self, record: RobotRecord) -> None:
         """Stop a robot whose pose jumped; it keeps its cells until its poses have agreed for a while."""

@@ -68,6 +68,20 @@ def test_cells_of_robots_without_a_known_place_are_ignored(planner: FleetPlanner
     assert "jumped" in ignored(planner, "Robot1", (6,), 2.0)
 
 
+@pytest.mark.parametrize("jumps", [True, False])
+def test_what_a_lost_robot_reported_of_late_is_free(planner: FleetPlanner, jumps: bool) -> None:
+    """It was not where its poses said; what it reported long ago, or another robot since, stays blocked."""
+    planner.handle(PoseSeen("Robot2", 3.5, 3.5, 0.0), 0.0)
+    planner.handle(ObstacleSeen("Robot1", (5, 6, 9, 10)), 1.0)
+    planner.handle(ObstacleSeen("Robot1", (6, 9)), 90.0)
+    planner.handle(ObstacleSeen("Robot2", (9,)), 91.0)
+    planner.handle(CellBlocked(10), 92.0)
+    planner.handle(ObstacleSeen("Robot1", (10,)), 93.0)
+    lost = PoseSeen("Robot1", 900.0, 0.5, 0.0) if jumps else PoseSeen("Robot1", 0.5, 0.5, 0.0, 2.5, 0.1)
+    assert blocked(planner.handle(lost, 100.0))[-1] == (5, 9, 10)
+    planner.validate()
+
+
 def test_cells_that_a_robot_cannot_see_are_ignored() -> None:
     planner = FleetPlanner(GridMap(20, 20))
     planner.handle(PoseSeen("Robot1", 0.5, 0.5, 0.0), 0.0)
