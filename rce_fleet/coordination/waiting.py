@@ -6,12 +6,28 @@ wait for another that rests on its path.
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.robot import Phase
 
 if TYPE_CHECKING:
     from rce_fleet.coordination.fleet_state import FleetState
+
+_RESTS = re.compile(r"deadlock: \S+ rests on its path, in cell (\d+)")
+
+
+def resting_cell(reason: str) -> int | None:
+    """Return the cell in which a robot rests on another one's path, from the reason why that one waits.
+
+    Args:
+        reason: One that :func:`find_deadlocks` gave, or another text.
+
+    Returns:
+        The cell; None: it waits for something else.
+    """
+    found = _RESTS.fullmatch(reason)
+    return None if found is None else int(found[1])
 
 
 def find_deadlocks(state: FleetState) -> dict[str, str]:

@@ -7,6 +7,7 @@ from math import inf, isfinite, nan
 from typing import Any
 
 from rce_fleet.coordination.following import ChangeFollower
+from rce_fleet.coordination.waiting import resting_cell
 from rce_fleet.manager.zones import read_zone
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import Lane, LaneGraph
@@ -184,6 +185,7 @@ class FactKeeper:
             known.moved_at = now
         known.cell, known.goal = cell, goal
         known.state, known.reason = robot["state"], robot["reason"]
+        known.barred_by = resting_cell(known.reason)
         details = _DETAILS.fullmatch(known.reason)
         if robot["mode"] != known.mode:
             known.mode_reason = ""

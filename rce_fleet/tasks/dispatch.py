@@ -360,7 +360,8 @@ class Dispatcher:
         used = {*book.places.chargers}.union(book.used_cells())
         used |= full_zones(book.zones.values(), facts, used)
         own_zones = [zone for zone in book.zones.values() if zone.kind == "blocked" and zone.robots]
-        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys(), own_zones)
+        barring = {robot.barred_by for robot in facts.robots.values() if robot.barred_by is not None}
+        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys(), own_zones, barring)
         self._parking.update(now, idle, self.chargers.charging, facts, cells)
 
     def _nearest(self, robot: RobotFacts, cells: Iterable[int]) -> int | None:

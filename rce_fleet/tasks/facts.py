@@ -40,6 +40,8 @@ class RobotFacts:
         mode: Who drives it, by its own mode and the fleet's.
         mode_reason: Why it has its mode, for people.
         is_known: Whether the planner knows it now.
+        barred_by: The cell of a robot that rests on its path and that the planner does not send away; None:
+            there is not one.
     """
 
     id: str
@@ -54,6 +56,7 @@ class RobotFacts:
     mode: str = AUTOMATIC
     mode_reason: str = ""
     is_known: bool = True
+    barred_by: int | None = None
 
     @property
     def is_there(self) -> bool:

@@ -33,16 +33,20 @@ class ParkingCells:
         used: Cells of open tasks, chargers, and full zones with either.
         taken: Cells to which robots go now for tasks, or where they act.
         own_zones: Zones that are blocked for single robots.
+        barring: Cells in which robots rest on the paths of others.
     """
 
     parking: AbstractSet[int]
     used: AbstractSet[int]
     taken: AbstractSet[int]
     own_zones: Collection[Zone] = ()
+    barring: AbstractSet[int] = frozenset()
 
     def is_in_way(self, cell: int) -> bool:
         """Return whether an idle robot in a cell has to go elsewhere."""
-        return cell in self.taken or (cell not in self.parking if self.parking else cell in self.used)
+        if cell in self.taken or cell in self.barring:
+            return True
+        return cell not in self.parking if self.parking else cell in self.used
 
     def closed_to(self, robot: str) -> set[int]:
         """Return the cells that only zones of its own close to a robot."""
@@ -112,13 +116,14 @@ class Parking:
             return
         avoided = {robot.cell for robot in facts.robots.values() if robot.cell is not None}
         avoided.update(self.cells.values(), cells.taken)
-        free = [cell for cell in cells.parking if cell not in avoided]
-        avoided |= cells.used
+        crowded = cells.used | cells.barring
+        free = [cell for cell in cells.parking if cell not in avoided and cell not in cells.barring]
+        avoided |= crowded
         searches = 0
         for robot in moves:
             place = self._ways.nearest(robot, free) if free else None
             may_search = searches < _SEARCHES and robot.id not in self._search_at
-            if place is None and may_search and robot.cell is not None and robot.cell in cells.used:
+            if place is None and may_search and robot.cell is not None and robot.cell in crowded:
                 searches += 1
                 refused = self._refused.setdefault(robot.id, set())
                 closed = cells.closed_to(robot.id)

@@ -13,6 +13,7 @@ from rce_fleet.coordination.events import CellBlocked, Tick
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.snapshot import RobotState
+from rce_fleet.coordination.waiting import resting_cell
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def test_a_robot_that_rests_on_a_path_is_reported(make_fleet: type[SimulatedClie
     fleet.send([5])
     text = "deadlock: Robot2 rests on its path, in cell 3"
     fleet.run(lambda: fleet.planner.snapshot().robots[0].reason == text)
+    assert resting_cell(text) == 3
+    assert resting_cell("deadlock: Robot1, Robot2 wait for each other") is None
 
 
 @pytest.mark.slow

@@ -55,6 +55,25 @@ def test_lanes_come_from_the_planners_state() -> None:
     assert facts.lanes is None
 
 
+def test_the_planner_tells_who_rests_on_a_path() -> None:
+    planner = FleetPlanner(GridMap(1, 6))
+    facts = FleetFacts()
+    keeper = FactKeeper(facts)
+    state = {**state_fields(Time(5, 0), planner), "started": {"secs": 5, "nsecs": 0}}
+    reasons = ("deadlock: Robot2 rests on its path, in cell 3", "")
+    for reason, cell in zip(reasons, (3, None), strict=True):
+        robot = {
+            "id": "Robot1",
+            "cell": 1,
+            "goal": 5,
+            "state": "waiting",
+            "reason": reason,
+            "mode": "automatic",
+        }
+        keeper.take_state({"sequence": 0, "state": {**state, "robots": [robot]}}, 1.0)
+        assert facts.robots["Robot1"].barred_by == cell
+
+
 @pytest.mark.parametrize(
     ("percentage", "capacity", "status", "level"),
     [

@@ -32,6 +32,20 @@ def test_an_idle_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
     assert robot.cell != 20
 
 
+@pytest.mark.parametrize("parking", [(), (20,), (20, 6)])
+def test_an_idle_robot_leaves_the_path_of_another_one(floor: Floor, parking: tuple[int, ...]) -> None:
+    """The planner ``dijkstra`` only tells who waits for it. A parking place can be on a path too."""
+    floor.book.emit(Places(parking=parking), "places", floor.now)
+    robot, other = floor.add("Robot1", 20), floor.add("Robot2", 16)
+    floor.go(23, robot="Robot2")
+    floor.stuck.add("Robot2")
+    floor.run(10)
+    assert robot.cell == 20
+    other.barred_by = 20
+    floor.run(20)
+    assert robot.cell == 6 if 6 in parking else robot.cell != 20
+
+
 @pytest.mark.parametrize("closes", ["cells", "edges"])
 def test_an_idle_robot_waits_where_no_own_zone_bars_it(floor: Floor, closes: str) -> None:
     """The planner would refuse the nearest cell in each step, and the robot stay in the way."""
