@@ -11,6 +11,7 @@ import numpy as np
 from rce_fleet.limits import MOST_LATE, within
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, driven, effort_of, share_needed
 from rce_fleet.tasks.matching import cheapest_pairs
+from rce_fleet.tasks.tails import tails_of
 from rce_fleet.tasks.travel import REFRESHED
 from rce_fleet.tasks.urgency import most_urgent_first
 
@@ -306,19 +307,21 @@ class Assigner:
         needed = np.full(len(tasks), -inf)
         taken = np.zeros(len(tasks))
         for row, task in enumerate(tasks):
-            tail = self._tail(task, group)
-            if tail is None:
+            if misfit(task, task.order.robot or group.names[0], profile):
                 continue
-            group.tails[row] = tail
+            tails = tails_of(task, group.cells, travel, profile, to_chargers)
+            if not tails:
+                continue
+            group.tails[row] = min(tails, key=lambda tail: tail.metres)
             self._write_ways(task, group, ways[row], profile.zone_cost)
             if metres is not ways:
                 self._write_ways(task, group, metres[row], zones)
-                tail = self._tail(task, group, in_metres=True) or tail
+                tails = tails_of(task, group.cells, travel, profile, to_chargers, in_metres=True) or tails
             if not charges(task):
-                end = tail.end
-                to_charger = 0.0 if to_chargers is None or end is None else float(to_chargers[end])
-                needed[row] = share_needed(tail._replace(first=0.0), profile, to_charger)
-                taken[row] = share_needed(tail._replace(first=0.0), profile)
+                rests = [tail._replace(first=0.0) for tail in tails]
+                taken[row] = min(share_needed(rest, profile) for rest in rests)
+                # In which cell a robot makes the first stop is known later: none is left out for another one.
+                needed[row] = min(share_needed(rest, profile, _way(rest.end, to_chargers)) for rest in rests)
         needed += self._levels.critical
         self._forbid_beyond_batteries(group, metres, needed)
         nearest = ways.min(axis=1, initial=inf)
@@ -367,15 +370,6 @@ class Assigner:
             ways[metres[rows] > (group.batteries - needed[rows, None]) / each] = inf
         group.ways[rows] = ways
 
-    def _tail(self, task: Task, group: _Group, *, in_metres: bool = False) -> Effort | None:
-        """Return what a task costs a robot of a profile after its first stop; None if it can never do it."""
-        if misfit(task, task.order.robot or group.names[0], group.profile):
-            return None
-        stop = task.next_stop
-        start = stop.cells[0] if stop is not None and stop.cells else int(group.cells[0])
-        tail = effort_of(task, start, self._travel, group.profile, in_metres=in_metres)
-        return tail if tail.first < inf else None
-
     def _write_ways(
         self, task: Task, group: _Group, ways: NDArray[np.float32], zones: Mapping[str, float]
     ) -> None:
@@ -423,6 +417,11 @@ class _Group:
         )
         self.worked = np.array([robot.worked for robot in robots], np.float64)
         self.tails: dict[int, Effort] = {}
+
+
+def _way(cell: int | None, ways: NDArray[np.float32] | None) -> float:
+    """Return the metres from a cell, of the ways from all cells; 0 if one of them is not known."""
+    return 0.0 if cell is None or ways is None else float(ways[cell])
 
 
 def _most_tasks(robots: int) -> int:

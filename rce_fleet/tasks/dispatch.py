@@ -20,6 +20,7 @@ from rce_fleet.tasks.parking import Parking, ParkingCells, full_zones
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
 from rce_fleet.tasks.robot_queues import RobotQueues
+from rce_fleet.tasks.tails import tails_of
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
 from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
 from rce_fleet.tasks.travel_loops import measure_ways
@@ -300,7 +301,8 @@ class Dispatcher:
         cells = [cell for stop in range(task.position, last) for cell in task.order.stop(stop).cells]
         if self._travel.missing(cells, profile.zone_cost):
             return None  # measured by a step: a request must not take so long
-        takes = effort_of(task, cells[0] if cells else 0, self._travel, profile).seconds(profile)
+        tails = tails_of(task, np.zeros(1, np.int64), self._travel, profile, None)
+        takes = min((tail.seconds(profile) for tail in tails), default=inf)
         return None if takes == inf else max(now, task.order.earliest_start or now) + takes
 
     # Parts of a step

@@ -8,12 +8,15 @@ import pytest
 
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, _Group
+from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.energy import BatteryLevels
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.queueing import MOST_SKIPPED, MOST_TASKS, Queues, RobotQueue
-from rce_fleet.tasks.records import RobotProfile
+from rce_fleet.tasks.records import Places, RobotProfile
 from rce_fleet.tasks.task import Task
 from rce_fleet.tasks.travel import TravelCosts
+
+from .conftest import Floor
 
 AISLE = GridMap(1, 10)
 
@@ -141,3 +144,51 @@ def test_tasks_behind_a_wall_leave_queues_to_others() -> None:
     inserted = [queues.insert(tasks, [RobotQueue("A", RobotProfile(), 0, 10.0)]) for _ in range(3)]
     assert [len(found) for found in inserted] == [0, 0, 2]
     assert {(task.number, robot) for task, robot in inserted[2]} == {(500, "A"), (501, "A")}
+
+
+@pytest.mark.parametrize("cells", [(7, 45), (45, 7)])
+@pytest.mark.parametrize("is_busy", [False, True])
+def test_a_stop_with_a_cut_off_cell_is_made_in_another(
+    floor: Floor, cells: tuple[int, int], *, is_busy: bool
+) -> None:
+    """With the cut-off cell first the task waited without end, also in a queue."""
+    floor.add("Robot1", 20)
+    floor.facts.shut, floor.facts.map_revision = frozenset({6, 15}), 1
+    if is_busy:
+        floor.book.create(Order((Stop(Action.GO, (21,), 20.0),)), floor.now)
+        floor.run(3)
+    task = floor.book.create(Order((Stop(Action.PICK, cells), Stop(Action.DELIVER, (40,)))), floor.now)
+    floor.dispatcher.measure(floor.facts)
+    assert floor.dispatcher.earliest_end(task, floor.now) == pytest.approx(floor.now + 5 / 0.4)
+    floor.run_until_ended(task, most=100)
+    assert [visit.cell for visit in floor.task(task).visits] == [45, 40]
+
+
+@pytest.mark.parametrize("cells", [(0, 398), (398, 0)])
+@pytest.mark.parametrize("is_last", [False, True])
+def test_a_far_cell_of_a_stop_takes_no_energy_of_a_near_one(cells: tuple[int, int], *, is_last: bool) -> None:
+    floor = Floor(GridMap(20, 20), TaskRules(profile=RobotProfile(capacity=1.0, drive=0.012, idle=0.0)))
+    floor.book.emit(Places(chargers=(379,)), "places", floor.now)
+    floor.add("Robot1", 397, battery=0.3)
+    stops = (Stop(Action.PICK, cells), Stop(Action.DELIVER, (399,)))
+    task = floor.book.create(Order((Stop(Action.GO, cells),) if is_last else stops), floor.now)
+    floor.run_until_ended(task, most=60)
+    assert floor.task(task).visits[0].cell == 398
+
+
+def test_a_robot_without_battery_needs_no_way_to_a_charger(floor: Floor) -> None:
+    floor.book.emit(Places(chargers=(7,)), "places", floor.now)
+    floor.add("Robot1", 20)
+    floor.facts.shut, floor.facts.map_revision = frozenset({6, 15}), 1
+    task = floor.book.create(Order((Stop(Action.GO, (45, 46)),)), floor.now)
+    floor.run_until_ended(task, most=60)
+
+
+def test_a_first_stop_without_cells_asks_each_robot(floor: Floor) -> None:
+    """The first robot of the profile is cut off from the second stop, the other one is not."""
+    floor.add("Robot1", 7)
+    floor.add("Robot2", 20)
+    floor.facts.shut, floor.facts.map_revision = frozenset({6, 15}), 1
+    task = floor.book.create(Order((Stop(Action.PARK), Stop(Action.GO, (40,)))), floor.now)
+    floor.run_until_ended(task, most=100)
+    assert floor.task(task).robot == "Robot2"
