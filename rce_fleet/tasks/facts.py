@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 AT_REST = frozenset({"idle", "arrived"})
 """States of the planner in which a robot has nothing to do."""
-AWAY = frozenset({"silent", "joining"})
-"""States in which the planner cannot send a robot anywhere."""
+AWAY = frozenset({"silent", "joining", "lost"})
+"""States in which the planner cannot send a robot anywhere: it does not hear it, or know its place."""
 MOST_STEPS = 100
 """So many steps of the clock are remembered."""
 NOT_DRIVEN = frozenset({"paused", "stopped", "manual", "out_of_service", "dead", "lost"})
-"""States in which the planner does not drive a robot: a person decided so, or the robot is lost."""
+"""States in which a robot cannot move: a person decided so, or it is lost."""
 
 
 @dataclass(slots=True)
@@ -35,7 +35,7 @@ class RobotFacts:
         goal: Its goal in the planner; None: none.
         battery: Share of the full battery, 0 .. 1; None: not known.
         moved_at: When its cell changed last, or it got its goal: seconds since 1970.
-        away_since: Since when it has been silent, joining or not in the planner; ``inf``: it is there.
+        away_since: Since when it has been silent, joining, lost or not in the planner; ``inf``: it is there.
         by_hand: Whether it drives to a goal that a person or another program gave it.
         mode: Who drives it, by its own mode and the fleet's.
         mode_reason: Why it has its mode, for people.

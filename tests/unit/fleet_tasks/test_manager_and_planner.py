@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from math import nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ import pytest
 from support.fleet_manager import GO, ManagerClient
 
 from rce.ros.types import Time
+from rce_fleet.coordination.events import PoseSeen, ReportSeen, Tick
+from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.mirror import REFUSED_S
@@ -72,6 +74,23 @@ def test_the_planner_tells_who_rests_on_a_path() -> None:
         }
         keeper.take_state({"sequence": 0, "state": {**state, "robots": [robot]}}, 1.0)
         assert facts.robots["Robot1"].barred_by == cell
+
+
+def test_a_lost_robot_of_the_planner_is_away_until_it_is_found() -> None:
+    """The planner does not drive it meanwhile: its tasks are given to others, as of a silent one."""
+    planner, facts = FleetPlanner(GridMap()), FleetFacts()
+    keeper, centre = FactKeeper(facts), GridMap().centre(9)
+    for second, spread in ((1, 0.1), (2, 3.0), (3, 0.1)):
+        for now in (second, second + 0.5):
+            planner.handle(PoseSeen("Robot1", *centre, 0.0, spread, spread), now)
+            revision = planner.state.robots["Robot1"].revision
+            planner.handle(ReportSeen("Robot1", ClientReport(revision, ClientState.IDLE)), now)
+            planner.handle(Tick(), now)
+        state = {**state_fields(Time(second, 0), planner), "started": {"secs": second, "nsecs": 0}}
+        keeper.take_state({"sequence": 0, "state": state}, float(second))
+        robot = facts.robots["Robot1"]
+        found = ("lost", False, float(second)) if spread > 1 else ("idle", True, inf)
+        assert (robot.state, robot.is_there, robot.away_since) == found
 
 
 @pytest.mark.parametrize(

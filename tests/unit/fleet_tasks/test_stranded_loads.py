@@ -16,16 +16,18 @@ from rce_fleet.tasks.task import RETURN, Task, TaskState
 from .conftest import Floor
 
 
-def test_a_load_stays_with_a_silent_robot(floor: Floor) -> None:
+@pytest.mark.parametrize("state", ["silent", "lost"])
+def test_a_load_stays_with_a_silent_or_lost_robot(floor: Floor, state: str) -> None:
     first = floor.add("Robot1", 0)
     floor.add("Robot2", 63)
     task = floor.deliver(1, 20)
     floor.run(6)
-    first.state, first.away_since = "silent", floor.now
+    first.state, first.away_since = state, floor.now
     floor.run(60)
     waiting = floor.task(task)
     assert (waiting.state, waiting.robot) == (TaskState.SUSPENDED, "Robot1")
-    assert "its load is on Robot1" in waiting.reason
+    assert f"its load is on Robot1: Robot1 is {state}" in waiting.reason
+    assert "Where is the load that Robot1 has" in waiting.question
     first.state, first.away_since = "idle", float("inf")
     floor.run_until_ended(task)
     assert floor.task(task).state is TaskState.DONE

@@ -13,16 +13,18 @@ from rce_fleet.tasks.task import Task, TaskState
 from .conftest import Floor
 
 
-def test_a_silent_robots_task_goes_to_another(floor: Floor) -> None:
+@pytest.mark.parametrize("state", ["silent", "lost"])
+def test_a_silent_or_lost_robots_task_goes_to_another(floor: Floor, state: str) -> None:
     first = floor.add("Robot1", 0)
     floor.add("Robot2", 63)
     task = floor.go(5, 6)
     floor.run(2)
-    first.state, first.away_since = "silent", floor.now
+    first.state, first.reason, first.away_since = state, "its pose is uncertain", floor.now
     floor.run(10)
     assert floor.task(task).robot == "Robot1"
     floor.run_until_ended(task)
     assert (floor.task(task).state, floor.task(task).robot) == (TaskState.DONE, "Robot2")
+    assert f"Robot1 is {state}: its pose is uncertain" in [event.text for event in floor.events]
 
 
 def test_a_stuck_robots_task_goes_to_another(floor: Floor) -> None:
