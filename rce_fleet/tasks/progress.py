@@ -146,6 +146,10 @@ class TaskProgress:
                 return
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
         if task.is_stranded:
+            if task.number in self._retry_at or not self._can_continue(task, robot):
+                if self._elapsed(task.changed_at, now) > self._rules.load_lost_after:
+                    self._book.advance(task, TaskCause.FAIL, now, f"{task.reason}; it was not brought away")
+                return
             task = replace(task, is_stranded=False, revision=task.revision + 1, reason="")
             self._book.emit(task, "continued", now, text=f"{robot.id} can continue")
         task = self._end_action(task, now, robot)
@@ -156,14 +160,14 @@ class TaskProgress:
 
     def _can_continue(self, task: Task, robot: RobotFacts) -> bool:
         """Return whether a path leads a robot with a load to its next stop; people are asked meanwhile."""
-        stop = task.next_stop
+        stop, _ = self._stop_of(task, robot)
         if task.action is not None or not task.is_loaded or stop is None:
             return True
         return self._nearest(robot, self._cells_of(stop, robot)) is not None
 
     def _go(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> bool:
         """Send the robot to the next stop; return whether it is there and its action began."""
-        stop, number = self._stop_of(task)
+        stop, number = self._stop_of(task, robot)
         if stop is None:
             self._finish(task, now)
             return False
@@ -201,15 +205,16 @@ class TaskProgress:
                 replace(task, revision=task.revision + 1), "low battery", now, text=f"{task.robot}: {lack}"
             )
 
-    def _stop_of(self, task: Task) -> tuple[Stop | None, int]:
+    def _stop_of(self, task: Task, robot: RobotFacts) -> tuple[Stop | None, int]:
+        """Return the stop that comes next, and its number; a cancelled load goes where a path leads."""
         if task.state is not TaskState.CANCELLING:
             return task.next_stop, task.position
         if not task.is_loaded:
             return None, RETURN
-        cells = task.order.return_cells or self._book.places.returns
-        if not cells:
-            source = task.load_from
-            cells = () if source is None else (source,)
+        source = () if task.load_from is None else (task.load_from,)
+        known = [cells for cells in (task.order.return_cells, self._book.places.returns, source) if cells]
+        reached = (cells for cells in known if self._nearest(robot, cells) is not None)
+        cells = next(reached, known[0] if known else ())
         duration = max((s.duration for s in task.order.stops if s.action is Action.DELIVER), default=0.0)
         return Stop(Action.DELIVER, cells, duration), RETURN
 
@@ -239,16 +244,13 @@ class TaskProgress:
         elif cells:
             reason = f"no path leads {robot.id} to cell {', '.join(map(str, cells[:5]))}"
         else:
-            reason = f"no cell is known for the stop {stop.action.value!r}: set chargers or parking places"
+            what = "return cells" if stop.action is Action.DELIVER else "chargers or parking places"
+            reason = f"no cell is known for the stop {stop.action.value!r}: set {what}"
         if task.reason != reason:
             self._tried_since[task.number] = now
             task = replace(task, reason=reason, revision=task.revision + 1)
             self._book.emit(task, "waits", now, text=f"{task.id} {reason}")
-        if (
-            not waits
-            and (not task.is_loaded or task.state is TaskState.RUNNING)
-            and self._waited(task, robot, now) > self._rules.unreachable_after
-        ):
+        if not waits and self._waited(task, robot, now) > self._rules.unreachable_after:
             self._give_up(task, now, reason)
             return self._book.tasks[task.number]
         return task
@@ -380,10 +382,8 @@ class TaskProgress:
             self._suspend(task, now, f"{what}: {reason}", is_away=is_away)
         elif self._elapsed(task.changed_at, now) > self._rules.load_lost_after:
             self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
-        elif is_away and task.state is TaskState.CANCELLING and task.action is None and not task.is_stranded:
-            reason = f"{what}: {reason}"
-            stranded = replace(task, is_stranded=True, target=None, revision=task.revision + 1, reason=reason)
-            self._book.emit(stranded, "question", now, text=stranded.question)
+        elif task.state is TaskState.CANCELLING and task.action is None and not task.is_stranded:
+            self._strand(task, now, f"{what}: {reason}", is_away=is_away)
         elif is_away and task.action is None and task.target is not None:
             waits = replace(task, target=None, revision=task.revision + 1)
             self._book.emit(waits, "waits", now, text=f"{what}: {reason}")
@@ -397,6 +397,17 @@ class TaskProgress:
         if suspended.question and (is_away or self._asked.get(task.number) != task.position):
             self._asked[task.number] = task.position
             self._book.emit(suspended, "question", now, text=suspended.question)
+
+    def _strand(self, task: Task, now: float, text: str, *, is_away: bool) -> None:
+        """Ask people for the load of a cancelled task: once, and each time its robot is away."""
+        stranded = replace(task, is_stranded=True, target=None, revision=task.revision + 1, reason=text)
+        if not is_away:
+            self._retry_at[task.number] = now + self._rules.unreachable_after
+        if is_away or self._asked.get(task.number) != RETURN:
+            self._asked[task.number] = RETURN
+            self._book.emit(stranded, "question", now, text=stranded.question)
+        else:
+            self._book.emit(stranded, "waits", now, text=text)
 
 
 def _bond(task: Task) -> str:

@@ -169,7 +169,8 @@ class Task:
         recurs_at: When its next occurrence is due; None: there is none.
         cancelled_by: Who cancelled it.
         asked: Digest of the first order, to recognize a second request with the same key.
-        is_stranded: Whether the robot that brings the load of a cancelled task away does not answer.
+        is_stranded: Whether the robot that brings the load of a cancelled task away does not answer, or finds
+            no way.
     """
 
     number: int

@@ -10,7 +10,7 @@ import pytest
 from rce_fleet.exceptions import TaskRefusedError
 from rce_fleet.tasks.loads import settle_load
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import RobotEntry
+from rce_fleet.tasks.records import Places, RobotEntry
 from rce_fleet.tasks.task import RETURN, Task, TaskState
 
 from .conftest import Floor
@@ -318,3 +318,76 @@ def test_the_question_ends_when_the_robot_comes_back(floor: Floor) -> None:
     assert floor.task(task).question == ""
     floor.run_until_ended(task)
     assert floor.task(task).state is TaskState.CANCELLED
+
+
+def _cancel_without_a_way(floor: Floor, *, is_on_its_way: bool = False) -> Task:
+    """Cancel a task whose robot has its load, and block the only return cell before or after that."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60, return_cells=(40,))
+    while floor.task(task).target != 60:
+        floor.run(1)
+    floor.run(3)
+    if is_on_its_way:
+        floor.book.cancel(task.id, floor.now)
+        floor.run(1)
+        assert floor.task(task).target == 40
+    floor.facts.shut, floor.facts.map_revision = frozenset({3, 40}), 1
+    if not is_on_its_way:
+        floor.book.cancel(task.id, floor.now)
+    return task
+
+
+@pytest.mark.parametrize("is_on_its_way", [False, True])
+@pytest.mark.parametrize("answer", ["freed", "told", ""])
+def test_a_cancelled_load_without_a_way_is_asked_for(
+    floor: Floor, answer: str, *, is_on_its_way: bool
+) -> None:
+    """The task waited without end, and people were not told."""
+    task = _cancel_without_a_way(floor, is_on_its_way=is_on_its_way)
+    floor.run(60)
+    assert floor.task(task).state is TaskState.CANCELLING
+    assert "Where is the load that Robot1 has" in floor.task(task).question
+    assert "its load is on Robot1: " in floor.task(task).reason
+    events = len(floor.events)
+    floor.run(300)
+    assert len(floor.events) == events
+    assert [event.name for event in floor.events].count("question") == 1
+    if answer == "told":
+        settle_load(floor.book, task.id, 5, floor.now)
+    elif answer:
+        floor.facts.shut, floor.facts.map_revision = frozenset({3}), 2
+    floor.run_until_ended(task, most=4000)
+    ended = floor.task(task)
+    assert ended.state is (TaskState.CANCELLED if answer else TaskState.FAILED)
+    assert ended.visits[-1].cell == (40 if answer == "freed" else 3)
+    assert floor.book.task_of("Robot1") is None
+
+
+def test_people_are_asked_once_for_a_stuck_cancelled_load(floor: Floor) -> None:
+    """It tries again and again, and fails after an hour."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    floor.run(2)
+    floor.stuck.add("Robot1")
+    floor.book.cancel(task.id, floor.now)
+    floor.run(1000)
+    names = [event.name for event in floor.events]
+    assert (names.count("question"), names.count("continued") > 3) == (1, True)
+    floor.run_until_ended(task, most=4000)
+    assert floor.task(task).state is TaskState.FAILED
+
+
+@pytest.mark.parametrize(("shut", "cell"), [((), 40), ((40,), 20), ((40, 20), 3)])
+def test_a_cancelled_load_goes_where_a_way_leads(floor: Floor, shut: tuple[int, ...], cell: int) -> None:
+    """To the task's return cell, else the fleet's, else where it was taken."""
+    floor.book.emit(Places(returns=(20,)), "places", floor.now)
+    task = floor.deliver(3, 60, return_cells=(40,))
+    floor.add("Robot1", 0)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    floor.facts.shut, floor.facts.map_revision = frozenset(shut), 1
+    floor.book.cancel(task.id, floor.now)
+    floor.run_until_ended(task, most=60)
+    assert (floor.task(task).state, floor.task(task).visits[-1].cell) == (TaskState.CANCELLED, cell)
