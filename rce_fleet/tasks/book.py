@@ -219,6 +219,9 @@ class TaskBook(FleetTables):
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be cancelled any more")
         cause = TaskCause.RETURN if task.is_bound else TaskCause.CANCEL
         by = f"cancelled by {user or 'a rule'}"
+        stop = task.next_stop if task.action is not None and not task.confirmed else None
+        if stop is not None and stop.confirm and stop.moves_load:  # a person may be handling the load
+            by += f"; waits for POST /tasks/{task.id}/confirm"
         ended = replace(task.after(cause, now, by), cancelled_by=user, recurs_at=None)
         if task.action is None:
             ended = replace(ended, target=None)

@@ -66,6 +66,11 @@ class Stop:
     confirm: bool = False
     label: str = ""
 
+    @property
+    def moves_load(self) -> bool:
+        """Whether a load is taken or given away."""
+        return self.action in (Action.PICK, Action.DELIVER)
+
 
 @dataclass(frozen=True, slots=True)
 class Order:

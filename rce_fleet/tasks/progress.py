@@ -303,7 +303,7 @@ class TaskProgress:
     def _is_over(
         self, task: Task, stop: Stop, visit: StopVisit, now: float, robot: RobotFacts | None
     ) -> bool:
-        if task.state is TaskState.CANCELLING and stop.action is Action.CHARGE:
+        if task.state is TaskState.CANCELLING and not stop.moves_load:
             return True
         if stop.confirm and not task.confirmed:
             return False
@@ -320,7 +320,9 @@ class TaskProgress:
 
     def _finish(self, task: Task, now: float) -> None:
         if task.state is TaskState.CANCELLING:
-            self._book.advance(task, TaskCause.CANCEL, now, f"{task.robot} has brought its load away")
+            has_returned = bool(task.visits) and task.visits[-1].stop == RETURN
+            what = "brought its load away" if has_returned else "ended its action"
+            self._book.advance(task, TaskCause.CANCEL, now, f"{task.robot} has {what}")
         elif task.state in (TaskState.RUNNING, TaskState.SUSPENDED):
             took = now - (task.started_at if task.started_at is not None else now)
             self._book.advance(task, TaskCause.FINISH, now, f"{task.robot} made all stops in {took:.0f} s")
@@ -364,9 +366,8 @@ class TaskProgress:
         if (visit := task.action) is not None:
             stop = _stop_of_visit(task, visit)
             is_cancelled = is_away and task.state is TaskState.CANCELLING
-            is_handling = stop.action in (Action.PICK, Action.DELIVER)
             # A robot that is only silent may be moving the load now: that takes its time.
-            can_end = not is_handling or self._book.entry(task.robot).is_out
+            can_end = not stop.moves_load or self._book.entry(task.robot).is_out
             if _fills_battery(stop) or (is_cancelled and can_end):
                 task = self._acted(task, stop, visit, now, is_given=not is_cancelled)
         if not task.is_bound:

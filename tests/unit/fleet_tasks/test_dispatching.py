@@ -361,6 +361,35 @@ def test_a_confirmed_stop_waits(floor: Floor) -> None:
     floor.run_until_ended(task)
 
 
+@pytest.mark.parametrize("action", [Action.GO, Action.PARK, Action.CHARGE])
+def test_a_cancelled_task_does_not_wait_at_a_stop(floor: Floor, action: Action) -> None:
+    """Neither for a person nor for the duration: no load moves there."""
+    floor.add("Robot1", 0)
+    task = floor.book.create(Order((Stop(action, (2,), 7200.0, confirm=True),)), floor.now)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    floor.book.cancel(task.id, floor.now)
+    floor.run(2)
+    ended = floor.task(task)
+    assert (ended.state, ended.reason) == (TaskState.CANCELLED, "Robot1 has ended its action")
+
+
+def test_a_cancelled_pick_says_that_it_waits_for_a_person(floor: Floor) -> None:
+    """The robot must not drive on while a person hands the load over."""
+    floor.add("Robot1", 0)
+    stops = (Stop(Action.PICK, (2,), confirm=True), Stop(Action.DELIVER, (20,)))
+    task = floor.book.create(Order(stops), floor.now)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    floor.book.cancel(task.id, floor.now, user="anna")
+    floor.run(50)
+    assert floor.task(task).reason == "cancelled by anna; waits for POST /tasks/T1/confirm"
+    floor.book.confirm(task.id, floor.now)
+    floor.run_until_ended(task, most=50)
+    assert (floor.task(task).state, floor.task(task).loads) == (TaskState.CANCELLED, 0)
+    assert floor.task(task).reason == "Robot1 has brought its load away"
+
+
 @pytest.mark.parametrize("seconds", [0.0, 7200.0])
 def test_a_cancelled_task_charges_no_further(floor: Floor, seconds: float) -> None:
     """Also at a charger that gives nothing: the robot would stand there without end."""
