@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import KeyReusedError, TaskRefusedError, UnknownTaskError
 from rce_fleet.limits import MOST_TIME
-from rce_fleet.tasks.loads import without_takeovers
+from rce_fleet.tasks.loads import check_delivered, without_takeovers
 from rce_fleet.tasks.order import check_cells, check_order
 from rce_fleet.tasks.tables import FleetTables
 from rce_fleet.tasks.task import TASK_LIFE, Task, TaskCause, TaskState
@@ -73,6 +73,7 @@ class TaskBook(FleetTables):
                 raise KeyReusedError(f"the key {key!r} belongs to {known.id}, which has another content")
             return known
         check_order(order)
+        check_delivered(order)
         if self.grid is not None:
             check_cells(order, self.grid)
         self._check_after(order)
@@ -106,6 +107,7 @@ class TaskBook(FleetTables):
         if task.has_ended or task.state is TaskState.CANCELLING:
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be changed any more")
         check_order(order)
+        check_delivered(order)
         made = task.position + (task.action is not None)
         if self.grid is not None:
             check_cells(order, self.grid, made)
@@ -147,6 +149,7 @@ class TaskBook(FleetTables):
                 recurs_at = due
             order = _order_at(task, order, recurs_at)
         check_order(order)
+        check_delivered(order)
         if self.grid is not None:
             check_cells(order, self.grid)
         changed = replace(task, order=order, revision=task.revision + 1, recurs_at=recurs_at)

@@ -99,6 +99,24 @@ def with_picks(task: Task, cell: int) -> Order:
     return replace(order, stops=(*order.stops[: task.position], *added, *order.stops[task.position :]))
 
 
+def check_delivered(order: Order) -> None:
+    """Check that an order delivers each load that it takes: the robot would keep it, and begin another task.
+
+    Raises:
+        TaskRefusedError: It does not.
+    """
+    taken = list[int]()
+    for number, stop in enumerate(order.stops, 1):
+        if stop.action is Action.PICK and stop.label != _TAKEOVER:  # which takes a load of a stop before it
+            taken.append(number)
+        elif stop.action is Action.DELIVER and taken:
+            taken.pop()
+    if taken:
+        raise TaskRefusedError(
+            f"stop {taken[0]} (pick) takes a load that no stop delivers: add a stop with the action deliver"
+        )
+
+
 def without_takeovers(order: Order) -> Order:
     """Return an order without the stops of :func:`with_picks`: they are for one load, not for each one."""
     stops = tuple(stop for stop in order.stops if stop.action is not Action.PICK or stop.label != _TAKEOVER)

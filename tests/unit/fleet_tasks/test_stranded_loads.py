@@ -97,6 +97,26 @@ def test_an_occurrence_keeps_a_pick_with_any_label(floor: Floor) -> None:
     assert floor.book.recur(task, floor.now).order.stops == stops
 
 
+@pytest.mark.parametrize("is_settled", [False, True])
+def test_a_change_cannot_leave_a_load_on_the_robot(floor: Floor, *, is_settled: bool) -> None:
+    """The task was done then, and the robot began the next one with the load."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    if is_settled:  # the load is picked up elsewhere
+        floor.book.hold(task.id, floor.now)
+        settle_load(floor.book, task.id, 5, floor.now)
+    order = floor.task(task).order
+    with pytest.raises(TaskRefusedError, match="a load that no stop delivers: add a stop"):
+        floor.book.change(task.id, replace(order, stops=order.stops[:-1]), floor.now)
+    floor.book.change(task.id, replace(order, priority=2), floor.now)
+    if is_settled:
+        floor.book.resume(task.id, floor.now)
+    floor.run_until_ended(task)
+    assert (floor.task(task).loads, robot.cell) == (0, 60)
+
+
 def test_a_lost_load_fails_its_task(floor: Floor) -> None:
     task = _vanish_with_load(floor)
     settle_load(floor.book, task.id, None, floor.now, user="anna")

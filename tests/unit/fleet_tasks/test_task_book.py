@@ -59,6 +59,7 @@ def test_a_changed_task_keeps_its_key(book: TaskBook) -> None:
         (Order((Stop(Action.GO, (1,), float("nan")),)), "duration"),
         (Order((Stop(Action.PICK, (1,)),), rounds=2), "deliver in each round"),
         (Order((Stop(Action.GO, (1,)),), occurrences=2), "every"),
+        (Order((Stop(Action.GO, (1,)), Stop(Action.PICK, (2,)))), "stop 2 .pick. takes a load that no stop"),
     ],
 )
 def test_impossible_orders_are_refused(book: TaskBook, order: Order, reason: str) -> None:
