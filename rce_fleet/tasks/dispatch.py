@@ -455,6 +455,7 @@ class Dispatcher:
         """Say of tasks that wait why no robot can do them."""
         robots = [robot for robot in facts.robots.values() if not self._book.entry(robot.id).is_out]
         placed = [self._free(robot) for robot in robots if robot.cell is not None]
+        placed.sort(key=lambda robot: 1.0 if robot.battery is None else robot.battery, reverse=True)
         known: dict[object, str] = {}
         waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
         begin = self._explained % len(waiting) if waiting else 0

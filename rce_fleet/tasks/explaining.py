@@ -16,13 +16,16 @@ if TYPE_CHECKING:
 
     from rce_fleet.tasks.assignment import Assigner, FreeRobot
     from rce_fleet.tasks.facts import RobotFacts
+    from rce_fleet.tasks.order import Order
     from rce_fleet.tasks.task import Task
     from rce_fleet.tasks.travel import TravelCosts
 
 MOST_ROBOTS = 20
-"""So many robots that fit are looked at for ways and batteries."""
+"""So many robots that fit, the fullest ones, are looked at for ways and batteries."""
 MOST_NAMED = 3
 """So many robots are named in a reason."""
+MOST_CELLS = 5
+"""So many cells are."""
 
 
 def why_none(
@@ -32,7 +35,7 @@ def why_none(
 
     Args:
         task: The task.
-        robots: Robots in service that it may be for.
+        robots: Robots in service that it may be for, those with the fullest batteries first.
         travel: Distances.
         assigner: Decides about batteries.
         chargers: Cells with chargers.
@@ -49,14 +52,18 @@ def why_none(
         if not lack:
             return ""
         lacks.add(lack)
-    cells, whom = ", ".join(str(cell) for cell in dict.fromkeys(task.order.cells())), task.order.robot
+    whom, battery = task.order.robot or "any robot", "no robot's battery"
+    if next(able, None) is not None:  # another one may do it later
+        whom, battery = f"any of {MOST_ROBOTS} robots", f"none of the {MOST_ROBOTS} fullest batteries"
     worst = next(lack for lack in ("energy", "capacity", "charger", "path") if lack in lacks)
+    if worst == "path":
+        stop = max(_unreached(task, robot, travel) for robot in fitting)
+        return f"no path leads {whom} to its {_place(task.order, stop)}"
     when = "it waits until one has charged" if chargers else "no charger is open"
     return {
-        "path": f"no path leads {whom or 'any robot'} to all of its stops (cells {cells})",
-        "charger": f"no path leads from its last stop to a charger (cells {', '.join(map(str, chargers))})",
-        "capacity": "no robot's battery is large enough for it, even when it is full; split the task",
-        "energy": f"no robot's battery has enough energy for it now; {when}",
+        "charger": f"no path leads from its last stop to a charger ({_cells(chargers)})",
+        "capacity": f"{battery} is large enough for it, even when it is full; split the task",
+        "energy": f"{battery} has enough energy for it now; {when}",
     }[worst]
 
 
@@ -95,6 +102,28 @@ def _lack(
     if needed == inf:
         return "charger"
     return "capacity" if needed > 1 else "energy" if robot.battery < needed else ""
+
+
+def _unreached(task: Task, robot: FreeRobot, travel: TravelCosts) -> int:
+    """Return the number of the first stop that a robot does not reach from the one before; or the last."""
+    order, here = task.order, robot.cell
+    for number in range(task.position, order.length):
+        if cells := order.stop(number).cells:
+            cell = travel.nearest(here, cells, robot.profile.zone_cost)
+            if cell is None:
+                return number
+            here = cell
+    return order.length - 1
+
+
+def _place(order: Order, number: int) -> str:
+    stop = order.stop(number)
+    return f"stop {number % len(order.stops) + 1} ({stop.action.value}, {_cells(stop.cells)})"
+
+
+def _cells(cells: Sequence[int]) -> str:
+    more = f" and {len(cells) - MOST_CELLS} more" if len(cells) > MOST_CELLS else ""
+    return f"cell{'s'[: len(cells) > 1]} {', '.join(map(str, cells[:MOST_CELLS]))}{more}"
 
 
 def _why_no_fit(task: Task, robots: Sequence[FreeRobot]) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from rce_fleet.exceptions import TaskRefusedError
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks.explaining import MOST_ROBOTS
 from rce_fleet.tasks.order import Action, Order, Stop, WhenLate
 from rce_fleet.tasks.records import Places, RobotEntry, RobotProfile
 from rce_fleet.tasks.task import TaskState
@@ -295,10 +296,18 @@ def test_a_change_of_the_recurrence_respects_its_count(
         ({"payload": 80.0}, "no robot that may do it carries 80 kg: the strongest, Robot2, carries 50 kg"),
         ({"capabilities": ("fork",)}, "no robot has all of the capabilities fork"),
         ({"robot": "Robot9"}, "only Robot9 may do it, which is not in service"),
-        ({}, "no path leads any robot to all of its stops (cells 63)"),
+        ({}, "no path leads any robot to its stop 1 (go, cell 63)"),
+        (
+            {"stops": tuple(Stop(Action.GO, (cell,)) for cell in (5, 6, 63)), "return_cells": (9,)},
+            "no path leads any robot to its stop 3 (go, cell 63)",
+        ),
+        (
+            {"stops": (Stop(Action.GO, (5,)), Stop(Action.GO, (63,))), "rounds": 2},
+            "no path leads any robot to its stop 2 (go, cell 63)",
+        ),
         (
             {"stops": (Stop(Action.GO, (63,)),), "robot": "Robot1"},
-            "no path leads Robot1 to all of its stops (cells 63)",
+            "no path leads Robot1 to its stop 1 (go, cell 63)",
         ),
         (
             {"stops": (Stop(Action.CHARGE),)},
@@ -315,6 +324,24 @@ def test_a_task_that_no_robot_can_do_says_why(order: dict[str, Any], reason: str
     task = floor.book.create(Order(**{"stops": stops, **order}), floor.now)
     floor.run(60)
     assert floor.task(task).reason == reason
+
+
+@pytest.mark.parametrize("battery", [1.0, 0.01])
+def test_empty_robots_hide_no_full_one_that_is_busy(battery: float) -> None:
+    """Of many robots that fit, some are looked at to say why none can do a task."""
+    floor = Floor(GridMap(10, 10))
+    floor.book.emit(Places(chargers=(55,)), "places", floor.now)
+    for number in range(MOST_ROBOTS):
+        floor.add(f"Robot{number}", number, battery=0.01)
+    full = floor.add("Robot99", 99, battery=1.0)
+    floor.book.create(Order((Stop(Action.GO, (98,), 300.0),), robot="Robot99"), floor.now)
+    floor.run(5)
+    full.battery = battery
+    tasks = [floor.go(90) for _ in range(6)]  # more than its queue takes
+    floor.run(20)
+    said = {floor.task(task).reason for task in tasks if floor.task(task).state is TaskState.QUEUED}
+    lack = "none of the 20 fullest batteries has enough energy for it now; it waits until one has charged"
+    assert said == {"" if battery == 1.0 else lack}
 
 
 def test_a_task_whose_robots_cannot_be_sent_says_so(floor: Floor) -> None:

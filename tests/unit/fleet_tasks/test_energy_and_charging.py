@@ -68,7 +68,7 @@ def test_a_task_beyond_all_chargers_says_so(hungry: Floor) -> None:
     task = hungry.go(7)
     hungry.run(15)
     assert hungry.task(task).state is TaskState.QUEUED
-    assert hungry.task(task).reason == "no path leads from its last stop to a charger (cells 56)"
+    assert hungry.task(task).reason == "no path leads from its last stop to a charger (cell 56)"
 
 
 def test_energy_is_checked_before_each_further_stop(hungry: Floor) -> None:
