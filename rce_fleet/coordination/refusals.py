@@ -74,12 +74,14 @@ def hindrance(
         reachable: Cells of its hull that other robots claim, are not in, and may drive to.
     """
     if not hull:
-        return "it is outside the map"
+        return "it is outside the map: localize it, or drive it onto the map by hand"
     if cell is None or reachable or (held and not state.ledger.length(record.id)):
         other = min(reachable or held or hull)
         return f"cell {other} is held by {state.ledger.owner(other)}"
     if _is_off_lanes(state, cell):
         return "it stands on no lane: drive it onto one by hand"
+    if cell in state.grid.blocked:
+        return f"it stands in cell {cell}, which is a wall: localize it, or drive it out by hand"
     if state.is_blocked(cell):
-        return "it stands in a blocked cell"
+        return f"it stands in cell {cell}, which is blocked: free the cell, or drive it out by hand"
     return ""

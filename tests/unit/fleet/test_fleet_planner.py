@@ -210,12 +210,28 @@ def test_a_new_robot_on_the_way_is_driven_around(make: Make) -> None:
     assert robot(fleet, 2).cell == 14
 
 
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((-5.0, 1.5), "it is outside the map: localize it, or drive it onto the map by hand"),
+        ((1.5, 1.5), "it stands in cell 9, which is a wall: localize it, or drive it out by hand"),
+    ],
+)
+def test_robot_that_cannot_be_placed_says_where_it_is(place: tuple[float, float], reason: str) -> None:
+    planner = FleetPlanner(GridMap(blocked=frozenset({9})))
+    for second in range(3):
+        planner.handle(PoseSeen("Robot1", *place, 0.0), 10.0 * second)
+    planner.handle(Tick(), 30.0)
+    assert planner.snapshot().robots[0].reason == reason
+
+
 def test_robot_in_a_blocked_cell_reports_why_it_cannot_join(make_fleet: type[SimulatedClients]) -> None:
     fleet = make_fleet(FleetPlanner(GridMap()), [], 1, loss=0.0)
     fleet.ask(CellBlocked(9))
     fleet.blocked = set()
     fleet.add_robot("Robot1", 9)
-    fleet.run(lambda: bool(fleet.states()) and robot(fleet).reason == "it stands in a blocked cell")
+    reason = "it stands in cell 9, which is blocked: free the cell, or drive it out by hand"
+    fleet.run(lambda: bool(fleet.states()) and robot(fleet).reason == reason)
     fleet.ask(CellFreed(9))
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
 
