@@ -90,7 +90,8 @@ class Dispatcher:
         self._progress = TaskProgress(book, self.rules.progress, charged=self.rules.battery.full)
         self._conditions = Conditions(book)
         self._assigner = Assigner(self._travel, self.rules.assignment, self.rules.battery)
-        self._queues = RobotQueues(book, self._travel, self.profile, self.rules.queue_length)
+        length, full = self.rules.queue_length, self.rules.battery.full
+        self._queues = RobotQueues(book, self._travel, self.profile, length, full)
         self._ways = IdleWays(self.rules.progress, self._nearest)
         self.chargers = ChargerQueue(self.rules.battery, self._ways)
         self._parking = Parking(self._ways, self.rules.park_after)
@@ -277,9 +278,8 @@ class Dispatcher:
         facts = self._facts.robots.get(task.robot) if self._facts is not None else None
         if task.state not in (TaskState.RUNNING, TaskState.ASSIGNED) or facts is None or facts.cell is None:
             return None
-        profile = self.profile(task.robot)
         if task.state is TaskState.RUNNING:
-            left = self._queues.left(task, facts.cell, profile, now)[0]
+            left = self._queues.left(task, facts, now)[0]
         else:
             left = self._queues.until_done(task, now, facts)
         return None if left == inf else now + left

@@ -127,6 +127,25 @@ def share_needed(effort: Effort, profile: RobotProfile, to_charger: float = 0.0)
     return drawn / profile.capacity
 
 
+def seconds_to_fill(task: Task, battery: float | None, profile: RobotProfile, full: float) -> float:
+    """Return how long a robot charges at the next stop of a task that charges until the battery is full.
+
+    Args:
+        task: The task.
+        battery: Share of the full battery now; None: not known.
+        profile: The robot's.
+        full: Share with which it leaves the charger.
+
+    Returns:
+        Seconds, 0 without such a stop; ``inf``: the charger gives no more than the robot takes.
+    """
+    left = (task.order.stop(number) for number in range(task.position, task.order.length))
+    if battery is None or not any(stop.action is Action.CHARGE and not stop.duration for stop in left):
+        return 0.0
+    lacking, watts = max(0.0, full - battery) * profile.capacity, profile.charging - profile.idle
+    return lacking / watts * _SECONDS_PER_HOUR if watts > 0 else inf if lacking else 0.0
+
+
 def charges(task: Task) -> bool:
     """Return whether the next stop of a task charges: the battery need not be enough for the rest."""
     stop = task.next_stop

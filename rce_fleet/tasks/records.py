@@ -35,7 +35,7 @@ class RobotProfile:
         drive: Watt hours for each metre.
         idle: Watts of electronics, sensors and computer.
         acting: Watts of an action at a stop, beside ``idle``.
-        charging: Watts that a charger gives.
+        charging: Watts that a charger gives, ``idle`` included: for when a battery will be full.
         zone_cost: How much more a metre in a zone costs this robot than elsewhere: 2 counts double.
     """
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.tasks.assignment import misfit
 from rce_fleet.tasks.batches import LATEST_S, is_plannable
-from rce_fleet.tasks.energy import effort_of
+from rce_fleet.tasks.energy import effort_of, seconds_to_fill
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC
 from rce_fleet.tasks.routing_problem import LONGEST_S
@@ -32,35 +32,43 @@ class RobotQueues:
         travel: Distances.
         profile: Returns what a robot can do.
         length: Most tasks in a queue.
+        full: Share of the full battery with which a robot leaves a charger.
     """
 
     def __init__(
-        self, book: TaskBook, travel: TravelCosts, profile: Callable[[str], RobotProfile], length: int
+        self,
+        book: TaskBook,
+        travel: TravelCosts,
+        profile: Callable[[str], RobotProfile],
+        length: int,
+        full: float,
     ) -> None:
         self._book = book
         self._travel = travel
         self._profile = profile
         self._queues = Queues(travel, length)
+        self._full = full
 
     def begin_step(self) -> None:
         """Forget how long tasks take: the map may be another one."""
         self._queues.begin_step()
 
-    def left(self, task: Task, cell: int, profile: RobotProfile, now: float) -> tuple[float, int | None]:
+    def left(self, task: Task, robot: RobotFacts, now: float) -> tuple[float, int | None]:
         """Return how many seconds of a task are left to a robot that does it, and where the robot is then.
 
         Args:
             task: The task.
-            cell: Where the robot is.
-            profile: The robot's.
+            robot: The robot.
             now: Seconds since 1970.
 
         Returns:
             Seconds, ``inf`` if no way leads to all stops; the cell of the last stop, None if no stop has one.
         """
-        effort = effort_of(task, cell, self._travel, profile)
-        acted = now - task.action.started_at if task.action is not None else 0.0
-        return max(0.0, effort.seconds(profile) - acted), effort.end
+        profile, stop, visit = self._profile(robot.id), task.next_stop, task.action
+        effort = effort_of(task, robot.cell or 0, self._travel, profile)
+        acted = min(now - visit.started_at, stop.duration) if visit is not None and stop is not None else 0.0
+        charging = seconds_to_fill(task, robot.battery, profile, self._full)
+        return max(0.0, effort.seconds(profile) - acted) + charging, effort.end
 
     def until_done(self, task: Task, now: float, robot: RobotFacts) -> float:
         """Return in how many seconds a robot will have done a task in its queue.
@@ -177,5 +185,5 @@ class RobotQueues:
         queued = self._book.queue_of(robot.id)
         if task is None:
             return RobotQueue(robot.id, profile, cell, 0.0, queued)
-        left, end = self.left(task, cell, profile, now)
+        left, end = self.left(task, robot, now)
         return RobotQueue(robot.id, profile, cell if end is None else end, left, queued)

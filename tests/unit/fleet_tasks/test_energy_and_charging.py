@@ -141,6 +141,23 @@ def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
     hungry.run_until_ended(task)
 
 
+@pytest.mark.parametrize(("watts", "seconds"), [(30.0, 90.0), (60.0, 45.0), (10.0, inf)])
+def test_a_task_that_charges_says_when_the_battery_is_full(watts: float, seconds: float) -> None:
+    """0.75 Wh are lacking; the robot itself takes 10 W. How long it has charged counts by its battery."""
+    profile = replace(HUNGRY, charging=watts + 10.0 if seconds < inf else watts, idle=10.0)
+    floor = Floor(rules=TaskRules(profile=profile))
+    floor.book.emit(Places(chargers=(56,)), "places", floor.now)
+    floor.add("Robot1", 57, battery=0.2)
+    task = floor.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (60,)))), floor.now)
+    ends = []
+    for _ in range(2):
+        floor.run(50)
+        assert floor.task(task).action is not None
+        ends.append(floor.dispatcher.expected_end(floor.task(task), floor.now))
+    expected = floor.now + seconds + 4 / profile.speed
+    assert ends == ([None] * 2 if seconds == inf else pytest.approx([expected - 50, expected]))
+
+
 @pytest.mark.parametrize("cells", [(), (56,)])
 @pytest.mark.parametrize("is_restarted", [False, True])
 def test_a_charge_stop_waits_for_a_robot_that_charges(
