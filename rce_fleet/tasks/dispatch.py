@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -438,7 +439,8 @@ class Dispatcher:
         if busy := self._queues.busy(now, facts.robots.values()):
             waiting = [task for task in self._conditions.ready if task.state is TaskState.QUEUED]
             waiting = most_urgent_first(waiting, self._book.clock_time(now), self.rules.assignment)
-            self._queues.fill(waiting, busy, now, self._progress.avoid.keys())
+            lack = partial(self._assigner.lack_of_energy, chargers=self._open_chargers())
+            self._queues.fill(waiting, busy, now, self._progress.avoid.keys(), facts.robots, lack)
 
     def _why_not(self, task: Task, name: str, robot: RobotFacts | None) -> str:
         """Return why a robot cannot keep a task in its queue; empty if it can."""

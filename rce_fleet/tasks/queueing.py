@@ -15,7 +15,7 @@ from rce_fleet.tasks.assignment import misfit
 from rce_fleet.tasks.energy import Effort, effort_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from rce_fleet.tasks.records import RobotProfile
     from rce_fleet.tasks.task import Task
@@ -68,7 +68,11 @@ class Queues:
         self._efforts.clear()
 
     def insert(
-        self, tasks: Sequence[Task], queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]] = ()
+        self,
+        tasks: Sequence[Task],
+        queues: Sequence[RobotQueue],
+        avoided: Collection[tuple[int, str]] = (),
+        lacks_energy: Callable[[Task, RobotQueue], bool] = lambda _task, _queue: False,
     ) -> list[tuple[Task, str]]:
         """Insert tasks into queues, in place; return which task went to which robot.
 
@@ -76,7 +80,9 @@ class Queues:
             tasks: Tasks without a robot, the most urgent first.
             queues: Of busy robots.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
+            lacks_energy: Returns whether a robot's battery is not enough for a task after its present one.
         """
+        self._lacks_energy = lacks_energy
         queues = [queue for queue in queues if len(queue.tasks) < self._length]
         queues = sorted(queues, key=lambda queue: (len(queue.tasks), queue.ready))[:MOST_QUEUES]
         room = sum(self._length - len(queue.tasks) for queue in queues)
@@ -155,7 +161,7 @@ class Queues:
             if misfit(task, queue.robot, queue.profile) or (task.number, queue.robot) in avoided:
                 continue
             took, _ = self._leg(task, queue.cell, queue.profile)
-            if took < inf:
+            if took < inf and not self._lacks_energy(task, queue):
                 ends.append((queue.ready + took, queue.robot, queue))
         ends.sort(key=lambda end: end[:2])
         return [queue for _, _, queue in ends]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
-from rce_fleet.tasks.assignment import misfit
+from rce_fleet.tasks.assignment import FreeRobot, misfit
 from rce_fleet.tasks.batches import LATEST_S, is_plannable
-from rce_fleet.tasks.energy import effort_of, seconds_to_fill
+from rce_fleet.tasks.energy import effort_of, seconds_to_fill, share_needed
+from rce_fleet.tasks.order import Action
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC
 from rce_fleet.tasks.routing_problem import LONGEST_S
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from rce_fleet.tasks.batches import Batch
     from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.energy import Effort
     from rce_fleet.tasks.facts import RobotFacts
     from rce_fleet.tasks.records import RobotProfile
     from rce_fleet.tasks.task import Task
@@ -127,6 +129,8 @@ class RobotQueues:
         queues: Sequence[RobotQueue],
         now: float,
         avoided: Collection[tuple[int, str]],
+        robots: Mapping[str, RobotFacts],
+        lack_of_energy: Callable[[Task, FreeRobot, Effort], str],
     ) -> None:
         """Put tasks into queues; note it in the book.
 
@@ -135,8 +139,21 @@ class RobotQueues:
             queues: Of busy robots.
             now: Seconds since 1970.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
+            robots: What is known of the robots, by name.
+            lack_of_energy: See :meth:`~rce_fleet.tasks.assignment.Assigner.lack_of_energy`.
         """
-        for task, name in self._queues.insert(tasks, queues, avoided):
+        batteries: dict[str, float | None] = {}
+
+        def lacks_energy(task: Task, queue: RobotQueue) -> bool:
+            name, cell, profile = queue.robot, queue.cell, queue.profile
+            if name not in batteries:
+                batteries[name] = self._battery_after(robots[name])
+            if batteries[name] is None:
+                return False
+            effort = effort_of(task, cell, self._travel, profile, in_metres=True)
+            return bool(lack_of_energy(task, FreeRobot(name, cell, profile, batteries[name]), effort))
+
+        for task, name in self._queues.insert(tasks, queues, avoided, lacks_energy):
             text = f"{task.id} is in the queue of {name}"
             self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
 
@@ -177,6 +194,17 @@ class RobotQueues:
         for task, move in zip(tasks, moves, strict=True):
             text = f"moved from {move.source} to {move.target}: the queued tasks together are done earlier"
             self._book.advance(task, TaskCause.ASSIGN, now, text, robot=move.target)
+
+    def _battery_after(self, robot: RobotFacts) -> float | None:
+        """Return the share of a robot's battery that its present task leaves; None: not known."""
+        task, profile = self._book.task_of(robot.id), self._profile(robot.id)
+        if robot.battery is None or robot.cell is None or task is None:
+            return None
+        left = (task.order.stop(number) for number in range(task.position, task.order.length))
+        if any(stop.action is Action.CHARGE for stop in left):
+            return None
+        effort = effort_of(task, robot.cell, self._travel, profile, in_metres=True)
+        return max(0.0, robot.battery - share_needed(effort, profile))
 
     def _queue_of(self, robot: RobotFacts, now: float) -> RobotQueue:
         """Return a robot's queue, which it begins with when its present task ends."""

@@ -132,6 +132,20 @@ def test_chargers_are_given_to_the_emptiest_first(hungry: Floor) -> None:
     assert hungry.dispatcher.chargers.charging == {third.id: 56}
 
 
+@pytest.mark.parametrize("charges", [False, True])
+def test_a_queue_takes_no_task_beyond_the_battery(hungry: Floor, *, charges: bool) -> None:
+    """The present task leaves 36 % of the battery; the far one was shown as assigned, with an end."""
+    hungry.add("Robot1", 40, battery=0.4)
+    stops = (Stop(Action.CHARGE if charges else Action.GO, (44,), 300.0),)
+    hungry.book.create(Order(stops), hungry.now)
+    hungry.run(10)
+    near, far = hungry.go(45), hungry.go(7)
+    hungry.run(3)
+    assert hungry.task(near).state is TaskState.ASSIGNED
+    assert hungry.task(far).state is (TaskState.ASSIGNED if charges else TaskState.QUEUED)
+    assert ("enough energy for it now" in hungry.task(far).reason) is not charges
+
+
 def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
     robot = hungry.add("Robot1", 0, battery=0.2)
     task = hungry.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (5,)))), hungry.now)
