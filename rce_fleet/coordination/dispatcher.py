@@ -323,6 +323,10 @@ class Dispatcher:
         in_others = here not in self.state.ledger.claims(record.id)
         return in_others or self._placement.nearest(record) not in granted
 
+    def is_in_last_cell(self, record: RobotRecord) -> bool:
+        """Return whether a robot's pose is in the last cell that it was granted."""
+        return self._placement.nearest(record) == self.state.ledger.end_of_grant(record.id)
+
     def arrive_by_pose(self, record: RobotRecord, now: float) -> None:
         """Release the last cell behind a robot that is judged by its poses, once it has stood for a while."""
         if now - record.still_since() >= self.settings.pose_only_settle:

@@ -122,7 +122,9 @@ def _under_way(state: FleetState, record: RobotRecord, settings: FleetSettings) 
 
 
 def _unheard(state: FleetState, record: RobotRecord) -> str:
-    """Return why a robot may be in cells that an earlier planner granted it; empty if its place is known."""
+    """Return why a robot may be in cells that it was granted before; empty if its place is known."""
+    if record.pose_only and record.earlier:
+        return f"{record.id} may be driving: no pose shows that it stopped; localize it twice, or remove it"
     if isnan(record.x) and state.ledger.claims(record.id):
         return f"{record.id} may be driving and has sent no pose yet: wait for it, or remove it"
     return ""

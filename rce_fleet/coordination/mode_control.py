@@ -95,6 +95,9 @@ class ModeControl:
         if record.phase is not Phase.SILENT:
             dispatcher.hold(record, reason)
         record.reason = reason
+        if record.pose_only:  # It may not have heard; of a dead one a person says that it does not drive.
+            is_dead = state.mode_of(record) is RobotMode.DEAD
+            record.earlier = frozenset() if is_dead else record.earlier | state.ledger.claims(record.id)
         state.ledger.unplace(record.id)
         dispatcher.watch(record)
 

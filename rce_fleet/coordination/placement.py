@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.settings import FleetSettings
 
 
+UNSEEN = "no pose shows that it stopped: localize it twice, or drive it by hand; it keeps its cells till then"
 _ROUNDING = 1e-6
 _SAMPLES = 20
 """Places on a way at which the cells that a robot overlaps are looked at: one in 5 cm of a cell of 1 m."""
@@ -125,11 +126,12 @@ class Placement:
                 state.touch(record)
                 self._ask_for_room(record)
             dispatcher.make_room(record)
-            if not hull <= own:
+            if not hull <= own and not self._would_lose(record, own, cell):
                 self._give_back(record, cell, own)
             return
         is_driven = state.mode_of(record) is RobotMode.AUTOMATIC
         state.change(record, Cause.SETTLED if is_driven else Cause.STAYED, "" if is_driven else record.reason)
+        record.earlier = frozenset()
         record.centred, record.leaving, record.doubted = False, entry.cell != cell, frozenset()
         state.ledger.place(record.id, entry.cell, self._open({cell, *own, *entry.swept}))
         if is_driven:
@@ -139,6 +141,21 @@ class Placement:
             record.reason = state.reason_of(record)
             dispatcher.avoid(record)
         dispatcher.arrive(record)
+
+    def _would_lose(self, record: RobotRecord, own: set[int], cell: int | None) -> bool:
+        """Return whether a robot whose poses may have ended would lose cells that it may still drive to.
+
+        Of a move client that answers nothing only a pose shows that it stopped. Cells behind are not entered.
+        """
+        if not record.pose_only or record.shows_rest(self._settings):
+            return False
+        ledger = self._state.ledger
+        granted = ledger.granted(record.id)
+        may_drive = len(granted) > 1 or (granted and not record.centred)
+        ahead = ledger.claims(record.id) if may_drive else frozenset[int]()
+        if cell in granted and not record.leaving:
+            ahead = frozenset(granted[granted.index(cell) + 1 :])
+        return not ahead | record.earlier <= own
 
     def _open(self, cells: Iterable[int]) -> set[int]:
         """Return the cells that may be claimed: of a blocked one, robots touch the margin around the box."""
@@ -178,7 +195,8 @@ class Placement:
         cell = standing_cell(state.grid, own, record.x, record.y, shut)
         reachable = {other for other in hull - own if self._may_drive_to(other)}
         held = set() if self._holders_wait(record, hull - own) else hull - own
-        return hull, own, cell, hindrance(state, record, hull, held, cell, reachable)
+        reason = UNSEEN if self._would_lose(record, own, cell) else ""
+        return hull, own, cell, reason or hindrance(state, record, hull, held, cell, reachable)
 
     def _holders_wait(self, record: RobotRecord, cells: Iterable[int]) -> bool:
         """Return whether the owners of cells stand there without a place: one of all has to leave first."""

@@ -253,6 +253,9 @@ class FleetPlanner:
             self._blocking.doubt(record.id)
         elif record.doubted and record.is_steady(self.settings) and not self.state.ledger.length(record.id):
             record.doubted = frozenset()
+        has_heard = record.pose_only and self._now - record.held_at >= self.settings.pose_only_settle
+        if has_heard and self.state.mode_of(record).is_followed:
+            record.earlier = frozenset()  # From now on its cells follow its poses.
 
     def _note_lost(self, record: RobotRecord, pose: PoseSeen) -> None:
         """Note whether a robot knows where it is, after its newest pose."""

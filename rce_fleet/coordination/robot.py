@@ -89,7 +89,8 @@ class RobotRecord:
         alive_at: When the robot last gave a sign of life: a pose, or what its move client heard of it. At
             first, when the robot's first message came.
         report: Last report of its move client.
-        earlier: Cells that an earlier planner may have granted it, until its move client tells which.
+        earlier: Cells that it was granted by an earlier planner, or before it was driven by hand, and may
+            still drive to, until its move client tells which or poses show that it does not.
         reported_at: When that came, likewise.
         obeyed_at: When its move client first reported to be at the end of the last list.
         goal: Its goal cell.
@@ -215,6 +216,13 @@ class RobotRecord:
     def is_steady(self, settings: FleetSettings) -> bool:
         """Whether its poses have agreed with each other for a while."""
         return self.alive_at - self.jumped_at >= settings.jump_settle_time
+
+    def shows_rest(self, settings: FleetSettings) -> bool:
+        """Whether a pose shows that it stands: one that came long after it was told to, at the same place.
+
+        Where its move client answers nothing and no such pose came, it may not have heard that it is to stop.
+        """
+        return self.posed_at - max(self.held_at, self._anchored_at) >= settings.pose_only_settle
 
     def stands(self, settings: FleetSettings) -> bool:
         """Whether it was told to stand still, acknowledged it, and its poses stay in one place.

@@ -46,7 +46,7 @@ class RobotWatch:
             record.reason = NO_POSE
             self._state.touch(record)
         elif record.phase is Phase.ACTIVE and self._stalled(record):
-            self._dispatcher.hold(record, "it did not move")
+            self._start_again(record)
         elif now - record.sent_at >= self._settings.repeat_after:
             self._repeat(record)
             if record.phase is Phase.HOLDING and now - record.held_at >= self._settings.hold_timeout:
@@ -58,7 +58,7 @@ class RobotWatch:
             since = self._dispatcher.now - record.reported_at
             if record.report is not None or isnan(record.x) or since < self._settings.pose_only_after:
                 return
-            record.pose_only, record.earlier = True, frozenset()
+            record.pose_only = True
             self._state.touch(record)
         if record.phase is Phase.HOLDING:
             record.hear(self._dispatcher.now, self._settings)
@@ -105,6 +105,17 @@ class RobotWatch:
         """Return whether a robot has had cells to drive to for long and has not moved."""
         since = max(record.still_since(), record.sent_at)
         return self._is_busy(record) and self._dispatcher.now - since > self._settings.stall_timeout
+
+    def _start_again(self, record: RobotRecord) -> None:
+        """Stop a robot that did not move, to send it anew.
+
+        Of one that is driven by its poses, and is not in its last cell, no pose would show that it stopped:
+        it is sent its cells again.
+        """
+        if record.pose_only and not self._dispatcher.is_in_last_cell(record):
+            self._dispatcher.send(record, tuple(self._state.ledger.granted(record.id)))
+        else:
+            self._dispatcher.hold(record, "it did not move")
 
     def _is_unconfirmed(self, record: RobotRecord) -> bool:
         """Return whether a move client has not acknowledged the last list."""

@@ -164,6 +164,10 @@ class SimulatedClients:
         self.silent: set[str] = set()
         self.mute: set[str] = set()
         """Robots whose move clients answer nothing."""
+        self.unposed: set[str] = set()
+        """Robots whose poses get lost."""
+        self.deaf: set[str] = set()
+        """Robots whose move clients hear nothing."""
         self.carried: set[str] = set()
         self.lies: dict[str, tuple[float, float]] = {}
         """Where robots say that they are, of those that do not say where they are."""
@@ -295,6 +299,8 @@ class SimulatedClients:
         x, y = self.lies.get(robot.id, (robot.x, robot.y))
         if hypot(x - posed_x, y - posed_y) >= self.pose_step:
             self.posed[robot.id] = x, y
+            if robot.id in self.unposed:
+                return
             self._post("pose", robot.id, self.tell, PoseSeen(robot.id, x, y, 0.0))
         if self.pose_step and self.clients[robot.id].report.target is not None:
             self._post("feedback", robot.id, self.signs[robot.id].take_pose, x, y, 0.0, self.now)
@@ -367,6 +373,8 @@ class SimulatedClients:
 
     def _carry_out(self, instruction: Instruction) -> None:
         match instruction:
+            case SendCells(robot) | SendCancel(robot) if robot in self.deaf:
+                pass
             case SendCells(robot, revision, cells):
                 self._post("cells", robot, self._cells, robot, revision, list(cells))
             case SendCancel(robot):

@@ -220,10 +220,53 @@ def lie(fleet: SimulatedClients, rng: Random, robot: str) -> None:
             fleet.lies[robot] = -30.0, 40.0
 
 
-def disturb(fleet: SimulatedClients, rng: Random, *, carries: bool) -> None:
+@pytest.mark.slow
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(2, 6), pose_step=st.sampled_from((0.0, 0.2)))
+def test_robots_driven_by_poses_that_end_meet_no_other(
+    make_fleet: type[SimulatedClients], seed: int, count: int, pose_step: float
+) -> None:
+    """Their move clients answer nothing, poses get lost for a while, and so do lists and cancellations."""
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    fleet = make_fleet(FleetPlanner(grid), rng.sample(grid.free, count), seed, loss=0.0, pose_step=pose_step)
+    fleet.mute = set(rng.sample(sorted(fleet.robots), count if pose_step else rng.randint(1, count)))
+    fleet.run(fleet.settled)
+    for _ in range(400):
+        lose_messages(fleet, rng)
+        fleet.step()
+    fleet.unposed.clear()
+    fleet.deaf.clear()
+    for name in (None, *sorted(fleet.planner.state.robots)):
+        assert fleet.ask(ModeSet(name, RobotMode.AUTOMATIC)).ok
+    for cell in sorted(fleet.blocked | fleet.planner.state.pending):
+        assert fleet.ask(CellFreed(cell)).ok
+    for _ in range(200):
+        fleet.step()
+    if not pose_step:
+        fleet.run(fleet.settled)
+        assert fleet.send_all(rng.sample(grid.free, count))
+        fleet.run(fleet.all_arrived)
+
+
+def lose_messages(fleet: SimulatedClients, rng: Random) -> None:
+    """Let poses of mute robots get lost or come again, or what they are told; and ask for something."""
+    for robot in sorted(fleet.mute):
+        if rng.random() < 0.02:
+            fleet.unposed ^= {robot}
+        if rng.random() < 0.02:
+            fleet.deaf ^= {robot}
+    what = rng.randrange(60)
+    if what in (17, 18):
+        change_rules(fleet, rng, what)
+    elif what < 14:
+        disturb(fleet, rng, carries=False, what=what)
+
+
+def disturb(fleet: SimulatedClients, rng: Random, *, carries: bool, what: int = -1) -> None:
     """Let something happen, mostly nothing; if it ``carries``, also to robots whose move clients are mute."""
     robots = sorted(fleet.robots)
-    what = rng.randrange(100)
+    what = rng.randrange(100) if what < 0 else what
     if what < 8 and robots:
         robot = rng.choice(robots)
         cell = rng.choice([None, *fleet.grid.free])

@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_fleet.coordination.events import GoalSet, PoseSeen, RobotHeard, SendCancel
+from rce_fleet.coordination.events import (
+    CellBlocked,
+    Event,
+    GoalSet,
+    ModeSet,
+    PoseSeen,
+    RobotHeard,
+    RobotsExpected,
+    SendCancel,
+)
+from rce_fleet.coordination.grid_change import refuse_grid
+from rce_fleet.coordination.modes import RobotMode
+from rce_fleet.coordination.placement import UNSEEN
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
@@ -128,3 +140,112 @@ def test_a_move_client_that_answers_nothing_is_driven_by_poses(make_fleet: type[
     fleet.mute.clear()
     fleet.run(lambda: not robot(fleet).pose_only)
     fleet.run(fleet.all_arrived)
+
+
+CORRIDOR = GridMap(3, 12, blocked=frozenset({*range(12), *range(24, 36)}) - {5, 29})
+"""The middle row is free, and one cell on each side of it."""
+
+
+def corridor(make_fleet: type[SimulatedClients], pose_step: float = 0.0) -> SimulatedClients:
+    """A robot that is driven by its poses, and was granted five cells of a corridor; another at its end."""
+    fleet = make_fleet(FleetPlanner(CORRIDOR), [12, 23], 1, loss=0.0, pose_step=pose_step)
+    fleet.mute = {"Robot1"}
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    assert fleet.ask(GoalSet("Robot1", 22)).ok
+    fleet.run(lambda: robot(fleet).granted == (12, 13, 14, 15, 16))
+    return fleet
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        GoalSet("Robot1", None),
+        CellBlocked(15),
+        ModeSet("Robot1", RobotMode.PAUSED),
+        ModeSet("Robot1", RobotMode.MANUAL),
+        ModeSet("Robot1", RobotMode.OUT_OF_SERVICE),
+        ModeSet(None, RobotMode.STOPPED),
+    ],
+)
+def test_a_robot_whose_poses_end_keeps_the_cells_ahead(
+    make_fleet: type[SimulatedClients], ends: Event
+) -> None:
+    """It may not have heard that it is to stop, and drives to the last of them; another robot waits."""
+    fleet = corridor(make_fleet)
+    fleet.unposed = fleet.deaf = {"Robot1"}
+    fleet.tell(ends)
+    assert fleet.ask(GoalSet("Robot2", 29)).ok
+    for _ in range(300):
+        fleet.step()
+        assert {13, 14, 15, 16} <= fleet.planner.state.ledger.claims("Robot1")
+    assert fleet.grid.cell_at(fleet.robots["Robot1"].x, fleet.robots["Robot1"].y) == 16
+    assert refuse_grid(fleet.planner, GridMap())
+    fleet.unposed, fleet.deaf = set(), set()
+    assert fleet.ask(ModeSet(None, RobotMode.AUTOMATIC)).ok
+    assert fleet.ask(ModeSet("Robot1", RobotMode.AUTOMATIC)).ok
+    fleet.run(lambda: robot(fleet).cell in (16, 22))
+
+
+def test_a_robot_is_placed_once_a_pose_shows_that_it_stands(make_fleet: type[SimulatedClients]) -> None:
+    """Its localization sends none at rest: until it is localized, twice, it keeps the cells ahead."""
+    fleet = corridor(make_fleet, pose_step=0.2)
+    assert fleet.ask(ModeSet("Robot1", RobotMode.PAUSED)).ok
+    for _ in range(300):
+        fleet.step()
+    assert (robot(fleet).state, robot(fleet).reason) == (RobotState.STOPPING, UNSEEN)
+    assert {13, 14, 15, 16} <= fleet.planner.state.ledger.claims("Robot1")
+    for _ in range(2):
+        fleet.posed.clear()
+        for _ in range(50):
+            fleet.step()
+    assert robot(fleet).state is RobotState.PAUSED
+    assert fleet.planner.state.ledger.claims("Robot1") <= {12, 13}
+    assert fleet.ask(ModeSet("Robot1", RobotMode.AUTOMATIC)).ok
+    fleet.run(lambda: robot(fleet).cell == 22)
+
+
+def test_a_robot_that_is_driven_by_hand_needs_one_pose(make_fleet: type[SimulatedClients]) -> None:
+    fleet = corridor(make_fleet)
+    fleet.unposed = {"Robot1"}
+    assert fleet.ask(ModeSet("Robot1", RobotMode.MANUAL)).ok
+    for _ in range(60):
+        fleet.step()
+    assert {13, 14, 15, 16} <= fleet.planner.state.ledger.claims("Robot1")
+    fleet.unposed = set()
+    fleet.run(lambda: fleet.planner.state.ledger.claims("Robot1").isdisjoint({14, 15, 16}))
+
+
+def test_a_robot_by_poses_that_stands_for_long_is_sent_again(make_fleet: type[SimulatedClients]) -> None:
+    """A person stood in its way. It is not stopped: no pose would show that it has."""
+    fleet = corridor(make_fleet, pose_step=0.2)
+    body = fleet.robots["Robot1"]
+    speed, body.speed = body.speed, 0.0
+    for _ in range(200):
+        fleet.step()
+        assert robot(fleet).state is RobotState.DRIVING
+    body.speed = speed
+    fleet.run(lambda: robot(fleet).cell == 22)
+
+
+def test_a_restarted_planner_keeps_the_cells_it_was_told(make_fleet: type[SimulatedClients]) -> None:
+    """Of a robot that it drives by its poses, of which it hears one from the middle of the drive."""
+    fleet = corridor(make_fleet)
+    fleet.unposed = {"Robot1"}
+    fleet.restart_planner(FleetPlanner(CORRIDOR))
+    fleet.tell(RobotsExpected({"Robot1": (12, 13, 14, 15, 16), "Robot2": (23,)}))
+    fleet.tell(PoseSeen("Robot1", *fleet.grid.centre(12), 0.0))
+    for _ in range(300):
+        fleet.step()
+        assert {13, 14, 15, 16} <= fleet.planner.state.ledger.claims("Robot1")
+    assert robot(fleet).pose_only
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_by_poses_arrives_though_its_last_pose_is_short(
+    make_fleet: type[SimulatedClients], seed: int
+) -> None:
+    """Localization sends none for the last centimetres; the cells behind it are free in the end."""
+    fleet = make_fleet(FleetPlanner(CORRIDOR), [12], seed, loss=0.0, pose_step=0.3)
+    fleet.mute = {"Robot1"}
+    fleet.send([18])
+    fleet.run(lambda: fleet.planner.state.ledger.claims("Robot1") == {18}, limit=120.0)
