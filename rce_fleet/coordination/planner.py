@@ -284,11 +284,22 @@ class FleetPlanner:
             record.goal, record.rest, record.goal_at = event.cell, None, self._now
             self.state.touch(record)
             self._dispatcher.require([record.id])
-            if record.phase is Phase.ACTIVE and len(self.state.ledger.granted(record.id)) > 1:
-                self._dispatcher.hold(record, "it has a new goal")
+            self._drop_path(record)
         if event.cell is None:
             return Reply(True, f"{record.id} has no goal")
         return Reply(True, f"{record.id} goes to cell {event.cell}")
+
+    def _drop_path(self, record: RobotRecord) -> None:
+        """Take a robot's path to its goal before; its new path begins where its granted cells end.
+
+        Without a goal it stops at once, unless it is driven by its poses: none might show that it stopped.
+        """
+        if record.phase is not Phase.ACTIVE:
+            return
+        if record.goal is None and not record.pose_only and len(self.state.ledger.granted(record.id)) > 1:
+            self._dispatcher.hold(record, "its goal was removed")
+        else:
+            self.state.ledger.truncate(record.id)
 
     def _remove_robot(self, event: RobotRemoved) -> Reply:
         if event.robot not in self.state.robots:

@@ -258,7 +258,14 @@ def test_a_new_goal_replaces_the_old_one(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(20):
         fleet.step()
-    assert fleet.ask(GoalSet("Robot1", 56)).ok
+    base = robot(fleet).granted
+    assert len(base) > 1
+    out = fleet.tell(GoalSet("Robot1", 56))
+    assert not [done for done in out if isinstance(done, SendCancel | SendCells)], "its base stays"
+    assert robot(fleet).plan == base
+    fleet.tell(Tick())
+    assert robot(fleet).plan[: len(base)] == base
+    assert robot(fleet).plan[-1] == 56
     fleet.run(fleet.all_arrived)
     assert robot(fleet).cell == 56
     assert robot(fleet).replans == 0, "a new goal is not a blocked path"
