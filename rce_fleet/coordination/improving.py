@@ -3,7 +3,8 @@
 Like new paths for some robots (see :mod:`rce_fleet.coordination.rerouting`) they are found on a copy of the
 ledger, among the visits of all, and entered between these. Granted cells stay as they are. The result is used
 only if all that the copy holds is still true: then it is one order of steps, in which no robots wait for each
-other in a circle. Nothing is granted while the process searches, which is for a twentieth of a second.
+other in a circle. Nothing is granted while the process searches, which is for a twentieth of a second. A late
+answer is ignored.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 EVERY = 1.0
 """Seconds between two improvements."""
+_LATE = 1.0
+"""Seconds after its time for which the process is waited for: it may be stopped, and the robots stand."""
 _FEWEST = 2
 """One robot alone has its shortest path already."""
 
@@ -49,6 +52,7 @@ class Improving:
 
     def __init__(self, state: FleetState, settings: FleetSettings) -> None:
         self._state = state
+        self._seconds = settings.improve_seconds
         self._is_on = settings.improve_seconds > 0 and settings.planner == DEFAULT_PLANNER
         self.is_due = False
         self._asked_at = -inf
@@ -65,6 +69,13 @@ class Improving:
         self._asked_at = now
         self._versions = {robot: self._state.ledger.version(robot) for robot in request.robots}
         self._map_version = self._state.map_version
+
+    def give_up(self, now: float) -> bool:
+        """Return whether the answer to the newest request is late and not waited for any longer."""
+        is_late = now - self._asked_at > self._seconds + _LATE
+        if is_late:
+            self.is_due = False
+        return is_late
 
     def take(self, request: PlanRequest, found: Rerouting) -> set[str]:
         """Enter better paths into the ledger, unless the state has changed since the request.

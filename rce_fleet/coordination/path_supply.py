@@ -128,7 +128,7 @@ class PathSupply:
             now: Time, seconds.
             is_tick: Whether the current event is a tick; single paths are found then.
         """
-        if self._asked is not None:
+        if self._awaits_answer(now):
             return None
         if self._partial and not self._state.index.under_way:
             self.outdated = True
@@ -152,6 +152,12 @@ class PathSupply:
         if is_tick and not self.concerned and self._improving.may_begin(now):
             return self._ask_for_better(now)
         return None
+
+    def _awaits_answer(self, now: float) -> bool:
+        """Return whether the process has a request; one for better paths is not waited for if it is late."""
+        if self._asked is not None and self._asked.improve_seconds and self._improving.give_up(now):
+            self._asked = None
+        return self._asked is not None
 
     def _ask_for_better(self, now: float) -> MakePlan:
         """Return a request to improve the paths that robots have."""

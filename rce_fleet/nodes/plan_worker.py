@@ -62,6 +62,10 @@ _LOAD_S = 15.0
 """How long a large request waits for loops from the cache; on an idle machine they take a second or two."""
 _ROBOTS_PER_TIMEOUT = 500
 """The time for a plan grows by the timeout for so many robots each."""
+_BETTER_S = 5.0
+"""How much longer than asked for the process may look for better paths: robots can do without."""
+_NEW_PATHS_S = 15.0
+"""How long it may look for new paths of some robots; if it finds none, one plan is made for all."""
 _ROBOTS = 20
 _CELLS = 10_000
 """Loops are compiled for requests with at least so many robots, or cells; they take 150 MB."""
@@ -136,6 +140,13 @@ class PlanWorker:
         """Return how many seconds a plan for so many robots may take."""
         return self.timeout * (1 + robots / _ROBOTS_PER_TIMEOUT)
 
+    def limit_for(self, request: PlanRequest) -> float:
+        """Return how many seconds the answer to a request may take."""
+        longest = self.time_for(len(request.robots))
+        if request.improve_seconds:
+            return min(longest, request.improve_seconds + _BETTER_S)
+        return longest if request.copy is None else min(longest, _NEW_PATHS_S)
+
     async def _compile(self) -> None:
         """Prepare a process with compiled loops."""
         try:
@@ -182,9 +193,10 @@ class PlanWorker:
     async def compute(self, request: PlanRequest) -> PlanResult:
         """Return a plan. If the process ends, it is restarted once.
 
-        If the planner fails, or the plan takes longer than :meth:`time_for` allows, this is logged, and the
-        plan has no visits: robots stand until single robots find paths, or something changes and the next
-        plan is asked for.
+        If the planner fails, or takes longer than :meth:`limit_for` allows, this is logged, and the plan has
+        no visits: robots keep their paths if better ones were asked for, and one plan for all follows if new
+        ones of some were. After a plan for all they stand until single robots find paths, or something
+        changes and the next plan is asked for.
 
         Cancelling leaves the process in the middle of its work: end it afterwards.
 
@@ -196,20 +208,12 @@ class PlanWorker:
         if self._compiling is not None and is_large(robots, cells):
             await self._await_cache()
         await self._take_compiled()
-        seconds = self.time_for(robots)
         try:
-            async with asyncio.timeout(seconds):
-                result = await self._ask_twice(request)
+            async with asyncio.timeout(self.time_for(robots)) as limit:
+                result = await self._ask_twice(request, limit)
         except TimeoutError:
             await self._end()
-            result = failed_plan(request, f"it took longer than {seconds:.0f} s")
-            self._log.error(
-                "the planner %r made no plan %d for %d robots within %.0f s; it was ended, and robots"
-                " only get single paths until the next plan. If it needs more time, set the parameter"
-                " plan_timeout; if it never ends, set the parameter planner to another one, such as %s",
-                *(request.planner, request.number, robots, seconds, DEFAULT_PLANNER),
-            )
-            return result
+            return self._give_up(request)
         if result.failure:
             self._log.error(
                 "the planner %r failed in plan %d for %d robots: %s; see its traceback on stderr",
@@ -217,13 +221,38 @@ class PlanWorker:
             )
         return result
 
-    async def _ask_twice(self, request: PlanRequest) -> PlanResult:
+    def _give_up(self, request: PlanRequest) -> PlanResult:
+        """Log that a request took too long; return the answer without its result."""
+        robots, seconds = len(request.robots), self.limit_for(request)
+        if request.improve_seconds:
+            self._log.warning(
+                "the plan process looked for better paths for more than %.0f s and was ended;"
+                " robots keep their paths",
+                seconds,
+            )
+            return nothing_better(request)
+        if request.copy is not None:
+            self._log.warning(
+                "the plan process found no new paths for %d of %d robots within %.0f s and was ended;"
+                " one plan is made for all",
+                *(len(request.copy.members), robots, seconds),
+            )
+        else:
+            self._log.error(
+                "the planner %r made no plan %d for %d robots within %.0f s; it was ended, and robots"
+                " only get single paths until the next plan. If it needs more time, set the parameter"
+                " plan_timeout; if it never ends, set the parameter planner to another one, such as %s",
+                *(request.planner, request.number, robots, seconds, DEFAULT_PLANNER),
+            )
+        return failed_plan(request, f"it took longer than {seconds:.0f} s")
+
+    async def _ask_twice(self, request: PlanRequest, limit: asyncio.Timeout) -> PlanResult:
         try:
-            return await self._ask(request)
+            return await self._ask(request, limit)
         except (asyncio.IncompleteReadError, ConnectionError):
             self._log.warning("the plan worker ended (%s); restarting it", await self._end(_ENDING_S))
         try:
-            return await self._ask(request)
+            return await self._ask(request, limit)
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             status = await self._end(_ENDING_S)
             raise PlanWorkerError(request.number, len(request.robots), status) from error
@@ -248,8 +277,13 @@ class PlanWorker:
         process, self._process = self._process, None
         return "it was ended" if process is None else await end(process, grace)
 
-    async def _ask(self, request: PlanRequest) -> PlanResult:
-        process = self._process or await self._start()
+    async def _ask(self, request: PlanRequest, limit: asyncio.Timeout) -> PlanResult:
+        loop = asyncio.get_running_loop()
+        process = self._process
+        if process is None:  # To load its loops may take longer than the limit of the request.
+            limit.reschedule(loop.time() + self.time_for(len(request.robots)))
+            process = await self._start()
+        limit.reschedule(loop.time() + self.limit_for(request))
         return msgspec.msgpack.decode(await ask(process, msgspec.msgpack.encode(request)), type=PlanResult)
 
 

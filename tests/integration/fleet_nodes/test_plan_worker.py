@@ -312,6 +312,27 @@ async def test_a_stopped_plan_process_is_ended(caplog: pytest.LogCaptureFixture)
     assert "made no plan 1 for 3 robots" in caplog.text
 
 
+@pytest.mark.parametrize("is_better", [True, False])
+async def test_a_search_for_paths_has_its_own_limit(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, is_better: bool
+) -> None:
+    """Robots stand meanwhile. Without better paths they keep theirs; without new ones all get a plan."""
+    for name in ("_BETTER_S", "_NEW_PATHS_S"):
+        monkeypatch.setattr(f"rce_fleet.nodes.plan_worker.{name}", 0.5)
+    seconds = 0.1 if is_better else 0.0
+    request = replace(late_request(1), improve_seconds=seconds)
+    async with PlanWorker(LOG, compiled=False) as worker:
+        (first,) = workers()
+        os.kill(first.pid, signal.SIGSTOP)
+        result = await worker.compute(request)
+        assert not first.is_running()
+        assert result.rerouting is not None
+        assert (result.rerouting.found, bool(result.failure)) == (is_better, not is_better)
+        assert await worker.compute(request_of(2)) == compute_plan(request_of(2))
+    assert ("keep their paths" if is_better else "one plan is made for all") in caplog.text
+    assert worker.limit_for(request) < worker.time_for(1) == worker.limit_for(request_of(1, robots=1))
+
+
 def test_large_fleets_have_more_time_for_a_plan() -> None:
     worker = PlanWorker(LOG, compiled=False, timeout=60)
     assert worker.time_for(0) == 60

@@ -124,6 +124,23 @@ def test_nothing_is_granted_while_better_paths_are_looked_for() -> None:
 
 
 @pytest.mark.slow
+def test_robots_drive_on_if_better_paths_are_late() -> None:
+    """The process is stopped: its answer is ignored when it comes, and other paths are found meanwhile."""
+    crowd = Crowd(settings=replace(SETTINGS, improve_seconds=0.05))
+    assert crowd.ask()
+    for robot, cells in zip(tuple(crowd.revisions), crowd.granted(), strict=True):
+        if len(cells) > 1:
+            crowd.tell(PoseSeen(robot, *crowd.planner.state.grid.centre(cells[1]), 0.0))
+    crowd.now += 2.0
+    crowd.sent.clear()
+    crowd.events(1)
+    assert crowd.sent
+    before = crowd.routes()
+    PlannerHarness.tell(crowd, PlanMade(compute_plan(replace(crowd.requests[-1], improve_seconds=1e9))))
+    assert crowd.routes() == before
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["a blocked cell", "a removed robot", "a new goal"])
 def test_better_paths_for_another_state_are_not_used(what: str) -> None:
     crowd = Crowd()
