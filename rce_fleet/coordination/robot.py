@@ -104,6 +104,7 @@ class RobotRecord:
         replans: How often it lost its path because a cell on it was blocked.
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
+        sent_again: How often it was sent the same cells again since it moved.
         pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
         jumped_at: When a pose came that cannot be true.
         doubted: Cells that it overlapped before such poses; it may be there still, until it is placed.
@@ -136,6 +137,7 @@ class RobotRecord:
     replans: int = 0
     held_at: float = -inf
     sent_at: float = -inf
+    sent_again: int = 0
     pose_only: bool = False
     jumped_at: float = -inf
     doubted: frozenset[int] = frozenset()
@@ -167,7 +169,7 @@ class RobotRecord:
         self.hear(now, settings)
         self.x, self.y, self.yaw, self.posed_at = x, y, yaw, now
         if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
-            self._anchor, self._anchored_at = (x, y), now
+            self._anchor, self._anchored_at, self.sent_again = (x, y), now, 0
             self._rested = 0.0
 
     def hear(self, alive_at: float, settings: FleetSettings) -> None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.robot import RobotRecord
     from rce_fleet.coordination.settings import FleetSettings
 
+_SENDS = 3
+"""A robot that is driven by its poses and does not move is sent its cells so often before it is held."""
 NO_POSE = "it has sent no pose yet: its localization does not run, or has no map or scans"
 
 
@@ -109,10 +111,12 @@ class RobotWatch:
     def _start_again(self, record: RobotRecord) -> None:
         """Stop a robot that did not move, to send it anew.
 
-        Of one that is driven by its poses, and is not in its last cell, no pose would show that it stopped:
-        it is sent its cells again.
+        Of one that is driven by its poses, and is not in its last cell, no pose may show that it stopped: it
+        is sent its cells again first. Once it is held the others plan around it.
         """
-        if record.pose_only and not self._dispatcher.is_in_last_cell(record):
+        is_between = record.pose_only and not self._dispatcher.is_in_last_cell(record)
+        if is_between and record.sent_again < _SENDS:
+            record.sent_again += 1
             self._dispatcher.send(record, tuple(self._state.ledger.granted(record.id)))
         else:
             self._dispatcher.hold(record, "it did not move")

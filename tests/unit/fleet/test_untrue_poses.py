@@ -215,7 +215,7 @@ def test_a_robot_that_is_driven_by_hand_needs_one_pose(make_fleet: type[Simulate
     fleet.run(lambda: fleet.planner.state.ledger.claims("Robot1").isdisjoint({14, 15, 16}))
 
 
-def test_a_robot_by_poses_that_stands_for_long_is_sent_again(make_fleet: type[SimulatedClients]) -> None:
+def test_a_robot_by_poses_that_stands_for_a_while_is_sent_again(make_fleet: type[SimulatedClients]) -> None:
     """A person stood in its way. It is not stopped: no pose would show that it has."""
     fleet = corridor(make_fleet, pose_step=0.2)
     body = fleet.robots["Robot1"]
@@ -225,6 +225,16 @@ def test_a_robot_by_poses_that_stands_for_long_is_sent_again(make_fleet: type[Si
         assert robot(fleet).state is RobotState.DRIVING
     body.speed = speed
     fleet.run(lambda: robot(fleet).cell == 22)
+
+
+def test_a_robot_by_poses_that_stands_for_long_is_passed(make_fleet: type[SimulatedClients]) -> None:
+    """Its poses ended, or it is stuck: its reason says so, and others plan around its cells."""
+    fleet = corridor(make_fleet)
+    fleet.unposed = {"Robot1"}
+    fleet.run(lambda: robot(fleet).reason == UNSEEN, limit=60.0)
+    assert {13, 14, 15, 16} <= fleet.planner.state.ledger.claims("Robot1")
+    assert fleet.ask(GoalSet("Robot2", 14)).ok
+    fleet.run(lambda: robot(fleet, 2).state is RobotState.UNREACHABLE, limit=20.0)
 
 
 def test_a_restarted_planner_keeps_the_cells_it_was_told(make_fleet: type[SimulatedClients]) -> None:
