@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rce_fleet.coordination.congestion import LearnedCosts
 from rce_fleet.coordination.events import Instruction, MakePlan
 from rce_fleet.coordination.improving import Improving
+from rce_fleet.coordination.own_planner import OwnPlanner
 from rce_fleet.coordination.repair import PathRepair
 from rce_fleet.coordination.replanning import PlanAdoption, PlanRequest, PlanResult, request_plan
 from rce_fleet.coordination.rerouting import adopt_rerouting
@@ -15,6 +16,7 @@ from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.starvation import StarvationGuard
 from rce_fleet.coordination.waiting import find_deadlocks
 from rce_fleet.coordination.zones import ZoneKind
+from rce_fleet.planning.planner import BUILT_IN_PLANNERS, INDEPENDENT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
 
-INDEPENDENT = "dijkstra"
-"""The planner that gives each robot its own shortest path, without regard to the others."""
 _LOOK_EVERY = 1.0
 """Seconds between two searches for robots that wait for each other."""
 _LONGEST_WAITS = 2
@@ -53,12 +53,14 @@ class PathSupply:
         self._improving = Improving(state, settings)
         self._learned = LearnedCosts(state) if settings.learn_congestion else None
         self._is_alone = settings.planner == INDEPENDENT
+        self._own = OwnPlanner(settings.planner)
         state.ledger.ordered = not self._is_alone
         self._looked_at = -inf
         self._waits_since: float | None = None
         self._deadlocked: set[str] = set()
         self._users: dict[str, set[str]] = {}
         self._asked: PlanRequest | None = None
+        self._asked_at = -inf
         self._zones = 0
         """Revision of the zones when the newest plan for all was requested."""
         self._versions: dict[str, int] = {}
@@ -98,6 +100,11 @@ class PathSupply:
                 self.concerned |= adopt_rerouting(self._state, request, result.rerouting, self._versions)
             else:
                 self.outdated = True
+            return
+        if result.failure and request.planner not in BUILT_IN_PLANNERS:
+            self._own.note_failure(self._asked_at, now)
+            self._asked = None
+            self.outdated = True
             return
         if self.outdated and self._awaited(now):
             self._asked = None
@@ -140,7 +147,7 @@ class PathSupply:
             need = self._guard.look(now)
             if need.paths:
                 self.require(need.paths)
-            self.outdated |= need.plan
+            self.outdated |= need.plan or (bool(self.concerned) and self._own.is_asked(now))
         if self.concerned and is_tick and not self.outdated:
             request = self._replan_concerned(now)
             self._improving.is_due = True
@@ -169,7 +176,9 @@ class PathSupply:
     def _ask(self, now: float) -> MakePlan:
         self.concerned.clear()
         self._guard.note_request()
-        self._asked = request_plan(self._state, self._settings, self._plans, now)
+        planner = self._own.name_at(now)
+        self._asked = request_plan(self._state, self._settings, self._plans, now, planner=planner)
+        self._asked_at = now
         self._zones = self._state.zones.revision
         self._plans += 1
         self.outdated = self._partial = False
@@ -244,6 +253,8 @@ class PathSupply:
         self._looked_at = now
         found = find_deadlocks(state)
         self._tell_deadlocks(found)
+        if found and self._own.is_asked(now):
+            self._own.note_failure(now, now)  # Its next plan would lead to the same deadlock.
         self.outdated |= bool(found) and (self._settings.resolve_deadlocks or not self._is_alone)
 
     def _tell_deadlocks(self, found: dict[str, str]) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rce_fleet.coordination.full_zones import note_unreachable
 from rce_fleet.coordination.improving import compute_improvement
+from rce_fleet.coordination.own_planner import find_fault
 from rce_fleet.coordination.rerouting import (
     MOST_TURNING,
     NO_CELL,
@@ -31,7 +32,12 @@ from rce_fleet.coordination.targets import assign_targets
 from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.planner import DEFAULT_PLANNER, PlanningProblem, load_planner
+from rce_fleet.planning.planner import (
+    BUILT_IN_PLANNERS,
+    DEFAULT_PLANNER,
+    PlanningProblem,
+    load_planner,
+)
 from rce_fleet.planning.straightening import ends_of
 
 if TYPE_CHECKING:
@@ -114,7 +120,8 @@ class PlanResult:
         steps: Step of each visit, from 1 on.
         ordered: Whether robots that keep the plan's order never wait for each other in a circle.
         rerouting: The new paths, where only some robots get new or better ones; then there are no visits.
-        failure: The error with which the planner ended, as type and text; then there are no visits.
+        failure: Why there is no plan: the planner's error, or what is wrong with its plan; then there are no
+            visits.
     """
 
     number: int
@@ -136,6 +143,7 @@ def request_plan(
     members: Sequence[str] = (),
     *,
     improve: bool = False,
+    planner: str = DEFAULT_PLANNER,
 ) -> PlanRequest:
     """Return the input of a plan from the fleet's state.
 
@@ -149,6 +157,7 @@ def request_plan(
         now: Time, seconds.
         members: Robots that need new paths, the first ones first; none: one plan is made for all.
         improve: Look for better paths instead; no robot needs a new one.
+        planner: Name of the planner that makes a plan for all.
     """
     for_all = not members and not improve
     # Better paths are compared by what they took when they were planned.
@@ -177,7 +186,7 @@ def request_plan(
         rests=tuple(rests),
         seed=settings.seed + number,
         effort=settings.effort,
-        planner=DEFAULT_PLANNER if settings.planner == "dijkstra" else settings.planner,
+        planner=planner,
         closed=tuple(sorted(state.zones.closed(state.grid))),
         costs=tuple(sorted(state.zones.costs().items())),
         move_costs=tuple((start, end, cost) for (start, end), cost in moves.items()),
@@ -264,6 +273,8 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
     if request.copy is not None:
         rerouting = compute_improvement(request) if request.improve_seconds else compute_rerouting(request)
         return PlanResult(request.number, (), (), (), complete=True, rerouting=rerouting)
+    if not request.robots:
+        return PlanResult(request.number, (), (), (), complete=True)
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
     forbidden = {index: frozenset(cells) for index, cells in request.forbidden}
     starts = dict(zip(request.robots, request.starts, strict=True))
@@ -294,6 +305,10 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         own_costs=own_costs,
     )
     joint = (planner or load_planner(request.planner)).plan(problem)
+    if request.planner not in BUILT_IN_PLANNERS:
+        fault = find_fault(joint, problem, grid, request.robots)
+        if fault:
+            return PlanResult(request.number, (), (), (), complete=False, failure=fault)
     steps, visitors, cells = joint.visits()
     # Robots that have arrived soon have another goal: the others wait for that, and not they for the others.
     ends = ends_of(joint.cells, np.array(request.goals, np.int32), lifelong=True)

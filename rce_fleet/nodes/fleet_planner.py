@@ -35,7 +35,6 @@ from rce_fleet.coordination.events import (
     Tick,
 )
 from rce_fleet.coordination.grid_change import next_planner, refuse_grid
-from rce_fleet.coordination.path_supply import INDEPENDENT
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import LanesError, MapError, PlannerError, ZoneError
@@ -53,6 +52,7 @@ from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.state_publisher import StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
+from rce_fleet.planning.planner import INDEPENDENT
 
 if TYPE_CHECKING:
     from rce.ros.types import Message

@@ -41,7 +41,7 @@ from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.worker_process import ask, end, frame, how_ended, receive, requests_of
 from rce_fleet.planning.path_improvement import PATH_IMPROVEMENT_KERNELS
-from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
+from rce_fleet.planning.planner import BUILT_IN_PLANNERS, DEFAULT_PLANNER, Planner, load_planner
 from rce_fleet.planning.rerouting import REROUTING_KERNELS
 
 if TYPE_CHECKING:
@@ -193,10 +193,11 @@ class PlanWorker:
     async def compute(self, request: PlanRequest) -> PlanResult:
         """Return a plan. If the process ends, it is restarted once.
 
-        If the planner fails, or takes longer than :meth:`limit_for` allows, this is logged, and the plan has
-        no visits: robots keep their paths if better ones were asked for, and one plan for all follows if new
-        ones of some were. After a plan for all they stand until single robots find paths, or something
-        changes and the next plan is asked for.
+        If the planner fails, its plan cannot be carried out, or it takes longer than :meth:`limit_for`
+        allows, this is logged, and the plan has no visits: robots keep their paths if better ones were asked
+        for, and one plan for all follows if new ones of some were. After a plan for all of another package's
+        planner the default one is asked; otherwise they stand until single robots find paths, or something
+        changes.
 
         Cancelling leaves the process in the middle of its work: end it afterwards.
 
@@ -216,8 +217,9 @@ class PlanWorker:
             return self._give_up(request)
         if result.failure:
             self._log.error(
-                "the planner %r failed in plan %d for %d robots: %s; see its traceback on stderr",
-                *(request.planner, request.number, robots, result.failure),
+                "the planner %r failed in plan %d for %d robots: %s; %s (the traceback of an exception is on"
+                " stderr)",
+                *(request.planner, request.number, robots, result.failure, what_follows(request)),
             )
         return result
 
@@ -239,10 +241,10 @@ class PlanWorker:
             )
         else:
             self._log.error(
-                "the planner %r made no plan %d for %d robots within %.0f s; it was ended, and robots"
-                " only get single paths until the next plan. If it needs more time, set the parameter"
-                " plan_timeout; if it never ends, set the parameter planner to another one, such as %s",
-                *(request.planner, request.number, robots, seconds, DEFAULT_PLANNER),
+                "the planner %r made no plan %d for %d robots within %.0f s; it was ended, and %s. If it"
+                " needs more time, set the parameter plan_timeout; if it never ends, set the parameter"
+                " planner to another one",
+                *(request.planner, request.number, robots, seconds, what_follows(request)),
             )
         return failed_plan(request, f"it took longer than {seconds:.0f} s")
 
@@ -294,6 +296,13 @@ async def _is_ready(process: Process) -> bool:
     except asyncio.IncompleteReadError:
         return False
     return True
+
+
+def what_follows(request: PlanRequest) -> str:
+    """Return what happens without the plan of a request, in words."""
+    if request.planner in BUILT_IN_PLANNERS:
+        return "robots only get single paths until the next plan"
+    return f"{DEFAULT_PLANNER} makes the plans for a while"
 
 
 def is_large(robots: int, cells: int) -> bool:

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 PLANNER_ENTRY_POINTS = "rce.planners"
 DEFAULT_PLANNER = "lacam"
+INDEPENDENT = "dijkstra"
+"""The planner that gives each robot its own shortest path, without regard to the others."""
+BUILT_IN_PLANNERS = frozenset({DEFAULT_PLANNER, INDEPENDENT})
 DEFAULT_EFFORT = 4_000_000
 """How many moves of single robots are tried before the search for a first plan gives up."""
 

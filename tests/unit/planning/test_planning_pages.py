@@ -22,6 +22,7 @@ def test_the_planner_of_the_page_makes_a_right_plan(capsys: pytest.CaptureFixtur
     assert re.fullmatch(r"True \d+\n", capsys.readouterr().out)  # and no faults
     body = planner[planner.index("class PriorityPlanner") :]
     assert len(body.splitlines()) <= 32
+    exec("none = PriorityPlanner().plan(PlanningProblem.of(problem.graph, [], []))", scope)
 
 
 def test_the_example_of_the_reference_plans(capsys: pytest.CaptureFixture[str]) -> None:
