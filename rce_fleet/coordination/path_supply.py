@@ -26,6 +26,12 @@ if TYPE_CHECKING:
 
 _LOOK_EVERY = 1.0
 """Seconds between two searches for robots that wait for each other."""
+_REPAIR_CELLS = 100_000
+"""So many cells are searched for repairs in one tick, in about 40 ms; larger maps are for the process."""
+_ALONE_CELLS = 50_000
+"""The same for the planner ``dijkstra``, whose searches count costs; at least one robot has its turn ..."""
+_MOST_ALONE = 50
+"""... and at most so many."""
 _LONGEST_WAITS = 2
 """However many robots stop one after another, a plan waits for them at most so often ``hold_timeout``."""
 
@@ -197,9 +203,10 @@ class PathSupply:
     def _replan_concerned(self, now: float) -> MakePlan | None:
         """Find new paths for the robots that need one; the others keep theirs.
 
-        The planner ``dijkstra`` finds them for some robots with each tick. Otherwise a robot in the way of
-        another may have to go first, so those that found none are tried again. If more robots need one than
-        the settings allow, or some find none, the planner's process looks for paths of all of them.
+        The planner ``dijkstra`` finds them for as many robots with each tick as the map's size allows.
+        Otherwise a robot in the way of another may have to go first, so those that found none are tried
+        again. If more robots need one than settings and map allow, or some find none, the planner's process
+        looks for paths of all of them.
         """
         state, settings = self._state, self._settings
         # Those that have waited longest find their paths first.
@@ -212,14 +219,14 @@ class PathSupply:
             key=lambda robot: (state.robots[robot].goal_at, robot),
         )
         if self._is_alone and not state.ledger.ordered:
-            turn = waiting[: settings.repairs or None]
+            turn = waiting[: min(_MOST_ALONE, max(_ALONE_CELLS // len(state.grid), 1))]
             self.concerned.difference_update(turn)
             for robot in turn:
                 state.ledger.truncate(robot)
                 self._repair.replan_alone(state.robots[robot])
             return None
         self.concerned.clear()
-        while waiting and len(waiting) <= settings.repairs:
+        while waiting and len(waiting) <= min(settings.repairs, _REPAIR_CELLS // len(state.grid)):
             effort = settings.repair_effort // len(waiting)
             left = [robot for robot in waiting if not self._repair.replan(state.robots[robot], effort)]
             if len(left) == len(waiting):

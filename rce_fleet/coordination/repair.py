@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.full_zones import note_unreachable
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.settings import FleetSettings
 
 _FIELDS = 256
-"""Distances to so many goals are kept while the map does not change."""
+"""Distances to so many goals at most are kept while the map does not change ..."""
+_FIELD_BYTES = 32_000_000
+"""... as long as they take no more memory."""
+_CELL_BYTES = array("i").itemsize
 
 
 class PathRepair:
@@ -34,7 +38,7 @@ class PathRepair:
         motion = Motion(settings.quarter_turn, settings.stop)
         self._turn_steps = motion.turn_steps.tolist() if motion.turn_steps.any() else None
         self._version = -1
-        self._fields: dict[tuple[int, frozenset[int], frozenset[tuple[int, int]]], list[int]] = {}
+        self._fields: dict[tuple[int, frozenset[int], frozenset[tuple[int, int]]], array[int]] = {}
 
     def replan(self, record: RobotRecord, effort: int) -> bool:
         """Give an active robot a new route beyond its granted cells; its old one may be its beginning.
@@ -161,15 +165,17 @@ class PathRepair:
             return None
         return Turns(heading_at_start(self._state, robot), self._state.grid.columns, self._turn_steps)
 
-    def _field(self, goal: int, robot: str, forbidden: frozenset[int]) -> list[int]:
+    def _field(self, goal: int, robot: str, forbidden: frozenset[int]) -> array[int]:
         """Return the number of moves to a goal from each cell, without regard to robots."""
         state = self._state
-        if self._version != state.map_version or len(self._fields) >= _FIELDS:
+        most = min(_FIELDS, _FIELD_BYTES // (_CELL_BYTES * len(state.grid)))
+        if self._version != state.map_version or len(self._fields) >= max(most, 1):
             self._fields.clear()
             self._version = state.map_version
         key = goal, forbidden, state.zones.closed_for(robot, state.grid)
         found = self._fields.get(key)
         if found is None:
             shut = state.blocked | state.pending | forbidden
-            found = self._fields[key] = moves_to(goal, state.grid.neighbours, shut, state.closed(robot))
+            moves = moves_to(goal, state.grid.neighbours, shut, state.closed(robot))
+            found = self._fields[key] = array("i", moves)
         return found

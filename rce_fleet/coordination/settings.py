@@ -47,8 +47,8 @@ class FleetSettings:
             see :mod:`rce_fleet.coordination.improving`; with ``lacam`` only. 0: never.
         learn_congestion: Whether moves for which robots waited of late cost more in new paths and plans, see
             :mod:`rce_fleet.coordination.congestion`.
-        repairs: At most so many robots get new paths at once, between the others'; if more need one, or
-            there is none, the planner's process looks for them, see
+        repairs: At most so many robots get new paths at once, between the others', and fewer on maps of more
+            than 33 000 cells; if more need one, or there is none, the planner's process looks for them, see
             :mod:`rce_fleet.coordination.rerouting`. 0: one plan is always made for all.
         repair_effort: Places and times that are tried at most for the paths of one tick.
         manual_clearance: Margin around robots that are driven by hand, instead of ``clearance``.

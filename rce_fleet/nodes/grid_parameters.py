@@ -13,7 +13,7 @@ from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.fleet_grid import BLOCKED_SHARE, fleet_grid
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.movingai import read_map
+from rce_fleet.planning.movingai import MAX_CELLS, read_map
 
 if TYPE_CHECKING:
     from rce.ros.node import Node
@@ -48,9 +48,15 @@ def make_grid(values: Mapping[str, Any]) -> GridMap:
     yaw = read_number(values, "origin_yaw", 0.0)
     if values.get("map"):
         return replace(read_map(Path(str(values["map"])), cell_size=size), origin=origin, yaw=yaw)
+    rows, columns = read_count(values, "rows", 8), read_count(values, "columns", 8)
+    if rows * columns > MAX_CELLS:
+        raise ValueError(
+            f"the parameters rows and columns, {rows} and {columns}, make {rows * columns} cells;"
+            f" at most {MAX_CELLS} are possible: choose a larger cell_size"
+        )
     return GridMap(
-        rows=read_count(values, "rows", 8),
-        columns=read_count(values, "columns", 8),
+        rows=rows,
+        columns=columns,
         cell_size=size,
         origin=origin,
         blocked=frozenset(read_cells(values, "walls")),

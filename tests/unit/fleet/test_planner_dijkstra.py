@@ -35,6 +35,24 @@ def test_paths_are_shortest_and_avoid_blocked_cells(make_fleet: type[SimulatedCl
     fleet.run(fleet.all_arrived)
 
 
+def test_many_robots_get_their_paths_with_one_tick(make_fleet: type[SimulatedClients]) -> None:
+    fleet = make_fleet(FleetPlanner(GridMap(), ALONE), list(range(8)), 1, loss=0.0)
+    fleet.send(list(range(56, 64)))
+    assert [len(robot.plan) for robot in fleet.planner.snapshot().robots] == [8] * 8
+
+
+def test_a_large_map_leaves_robots_to_the_next_ticks(
+    make_fleet: type[SimulatedClients], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The searches of a tick take no longer than a part of it."""
+    monkeypatch.setattr("rce_fleet.coordination.path_supply._ALONE_CELLS", 2 * 64)
+    fleet = make_fleet(FleetPlanner(GridMap(), ALONE), list(range(4)), 1, loss=0.0)
+    fleet.send(list(range(56, 60)))
+    assert [len(robot.plan) for robot in fleet.planner.snapshot().robots] == [8, 8, 1, 1]
+    fleet.tell(Tick())
+    assert [len(robot.plan) for robot in fleet.planner.snapshot().robots] == [8] * 4
+
+
 def test_robots_that_meet_head_on_are_reported(make_fleet: type[SimulatedClients]) -> None:
     fleet = make_fleet(FleetPlanner(LANE, ALONE), [0, 5], 1, loss=0.0)
     fleet.send([5, 0])

@@ -156,6 +156,8 @@ def test_the_planner_reads_a_map_by_its_parameters(tmp_path: Path) -> None:
     assert (grid.columns, grid.rows, grid.yaw) == (2, 4, 0.1)
     assert 0 in grid.blocked
     assert make_grid({"rows": 2, "columns": 2, "origin_yaw": 0.2}).yaw == 0.2
+    with pytest.raises(ValueError, match=r"rows and columns, 3000 and 2000, .* at most 4000000"):
+        make_grid({"rows": 3000, "columns": 2000})
 
 
 def test_a_movingai_map_lies_where_the_parameters_say(tmp_path: Path) -> None:
