@@ -57,6 +57,14 @@ class Compaction:
         kept: Ints = values[self._edges]
         return kept
 
+    def own_costs_on(self, guide: PlanningGraph) -> dict[int, Ints]:
+        """Return the own costs with the factors of a graph that has guidance and the same edges."""
+        if guide is self.graph or not self.own_costs:
+            return self.own_costs
+        factor = guide.costs // self.graph.costs
+        alike = {id(costs): costs * factor for costs in self.own_costs.values()}
+        return {robot: alike[id(costs)] for robot, costs in self.own_costs.items()}
+
     def compact(self, graph: PlanningGraph) -> PlanningGraph:
         """Return a graph with the same edges, numbered anew."""
         counts = np.diff(graph.indptr)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.graph import MAX_COST, PlanningGraph
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,8 +29,9 @@ def guided(graph: PlanningGraph, *, against: int = 2) -> PlanningGraph:
     """Return the graph of a grid with costs that prefer one direction in every aisle.
 
     An aisle is a straight line of nodes with walls, or the edge of the map, on both sides. Aisles of one row
-    or column have one direction; the next row or column with aisles has the opposite one. A graph that is not
-    of a grid, or has no aisles, is returned as it is.
+    or column have one direction; the next row or column with aisles has the opposite one. A move whose
+    opposite is closed keeps its cost: no robot comes from there. A graph that is not of a grid, or has no
+    aisles, is returned as it is.
 
     Args:
         graph: The graph; its costs are multiplied.
@@ -43,13 +44,17 @@ def guided(graph: PlanningGraph, *, against: int = 2) -> PlanningGraph:
     factors = aisle_factors(free.reshape(-1, graph.columns), against=against).reshape(-1, 4)
     sources = np.repeat(np.arange(len(graph)), np.diff(graph.indptr))
     offsets = {-graph.columns: DOWN, -1: LEFT, 1: RIGHT, graph.columns: UP}
-    factor = np.ones(len(sources), np.int32)
+    directions = np.zeros(len(sources), np.int32)
     for offset, direction in offsets.items():
-        chosen = graph.neighbours - sources == offset
-        factor[chosen] = factors[sources[chosen], direction]
+        directions[graph.neighbours - sources == offset] = direction
+    is_open = np.zeros((len(graph), len(offsets)), dtype=bool)
+    is_open[sources, directions] = True
+    is_two_way = is_open[graph.neighbours, UP - directions]
+    factor = np.where(is_two_way, factors[sources, directions], 1)
     if (factor == 1).all():
         return graph
-    return PlanningGraph(graph.indptr, graph.neighbours, graph.costs * factor, graph.columns)
+    costs = np.minimum(graph.costs * factor, MAX_COST)
+    return PlanningGraph(graph.indptr, graph.neighbours, costs, graph.columns)
 
 
 def aisle_factors(free: NDArray[np.bool_], *, against: int) -> Ints:

@@ -91,7 +91,7 @@ class LacamPlanner:
         part = Compaction(problem)
         steps = part.graph.unweighted
         guide = part.graph
-        if guide.is_unweighted and len(part.starts) >= _GUIDED_FROM * len(guide):
+        if len(part.starts) >= _GUIDED_FROM * len(guide):
             guide = part.compact(guided(problem.graph))
         if problem.motion is not None:
             return self._plan_in_motion(part, problem, problem.motion, guide, began + problem.seconds)
@@ -131,7 +131,8 @@ class LacamPlanner:
         turning = Turning.of(part.graph.unweighted, directions, part.goals, motion, part.forbidden)
         guided_turning = turning
         if guide is not part.graph or part.own_costs:
-            guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden, part.own_costs)
+            own_costs = part.own_costs_on(guide)
+            guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden, own_costs)
         best, least = JointPlan(part.original(part.starts[None]), complete=False), float("inf")
         seed = problem.seed
         effort = min(problem.effort, _SMOOTHING * len(part.starts))
@@ -222,9 +223,10 @@ def _search(
     turning: Turning | None = None,
     effort: int = 0,
 ) -> _Found:
-    table = _table(part, graph, part.own_costs)
+    own_costs = part.own_costs_on(graph)
+    table = _table(part, graph, own_costs)
     if turning is None and not problem.is_unweighted:
-        turning = Turning.without_turns(graph, table, part.own_costs)
+        turning = Turning.without_turns(graph, table, own_costs)
     search = ConfigurationSearch(
         graph,
         table,

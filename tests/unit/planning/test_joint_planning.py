@@ -15,8 +15,9 @@ from rce_fleet.compiled import Kernel
 from rce_fleet.exceptions import PlanningError
 from rce_fleet.planning import fields, improvement, lacam
 from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.compaction import Compaction
 from rce_fleet.planning.execution import execution_times
-from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.graph import MAX_COST, PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.guidance import DOWN, LEFT, RIGHT, UP, aisle_factors, guided
 from rce_fleet.planning.lacam import LacamPlanner
@@ -27,6 +28,10 @@ from rce_fleet.planning.planner import JointPlan, PlanningProblem
 SHELVES = GridMap(
     9, 16, blocked=frozenset(r * 16 + c for r in (2, 3, 5, 6) for c in (*range(3, 7), *range(8, 13)))
 )
+
+
+AISLES = GridMap(5, 9, blocked=frozenset({*range(1, 9), *range(19, 26), *range(36, 45)}))
+"""Two aisles, in the rows 1 and 3, from the first column to the last one, and a corner."""
 
 
 def drawn(
@@ -158,6 +163,43 @@ def test_guidance_keeps_graphs_without_aisles() -> None:
     graph = PlanningGraph.from_grid(GridMap())
     assert guided(graph) is graph
     assert not guided(PlanningGraph.from_grid(SHELVES)).is_unweighted
+
+
+@pytest.mark.parametrize("of_one_robot", [False, True], ids=["of all", "of one robot"])
+@pytest.mark.parametrize(("start", "goal", "row"), [(18, 26, 1), (26, 18, 3)], ids=["right", "left"])
+def test_costs_somewhere_leave_the_guidance(of_one_robot: bool, start: int, goal: int, row: int) -> None:
+    """Of two aisles of the same length a robot takes the one of its direction, though a corner is dear."""
+    costs = np.ones(len(AISLES), np.int32)
+    costs[0] = 5
+    plain, dear = PlanningGraph.from_grid(AISLES), PlanningGraph.from_grid(AISLES, costs=costs)
+    graph, own = (plain, {0: dear.costs}) if of_one_robot else (dear, None)
+    for seed in range(6):
+        problem = PlanningProblem.of(graph, [start], [goal], own_costs=own, seed=seed)
+        assert 9 * row + 4 in LacamPlanner(compiled=False).plan(problem).path(0)
+
+
+def test_own_costs_get_the_factors_of_guidance() -> None:
+    own = np.full(len(PlanningGraph.from_grid(AISLES).costs), 3, np.int32)
+    part = Compaction(PlanningProblem.of(PlanningGraph.from_grid(AISLES), [0], [9], own_costs={0: own}))
+    guide = part.compact(guided(PlanningGraph.from_grid(AISLES)))
+    assert part.own_costs_on(part.graph) is part.own_costs
+    assert (part.own_costs_on(guide)[0] == 3 * guide.costs).all()
+    assert guide.costs.max() == 2
+
+
+def test_guidance_leaves_moves_without_an_opposite() -> None:
+    """An operator's one-way aisle stays as cheap as it is, whatever its direction."""
+    grid = GridMap(1, 9)
+    costs = [guided(PlanningGraph.from_grid(grid)).costs]
+    for offset in (-1, 1):
+        closed = [(cell, cell + offset) for cell in range(9) if 0 <= cell + offset < 9]
+        costs.append(guided(PlanningGraph.from_grid(grid, closed=closed)).costs)
+    assert [each.max() for each in costs] == [2, 1, 1]
+
+
+def test_guidance_keeps_the_largest_costs_possible() -> None:
+    graph = PlanningGraph.from_grid(GridMap(1, 9), costs=np.full(9, MAX_COST))
+    assert guided(graph).costs.max() == MAX_COST
 
 
 @pytest.mark.slow
