@@ -18,7 +18,7 @@ from rce_fleet.exceptions import FleetError, PlanningError
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.fields import LANES, UNREACHABLE, distance_fields
 from rce_fleet.planning.graph import PlanningGraph
-from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.lacam import LacamPlanner, can_improve
 from rce_fleet.planning.lane_files import read_lanes
 from rce_fleet.planning.lifelong import LIFELONG_KERNELS, LifelongPlanner, LifelongSettings
 from rce_fleet.planning.movingai import read_map, read_scenario
@@ -41,8 +41,8 @@ _EFFORT_PER_ROBOT = 4000
 
 def plan(
     map_: Annotated[Path, typer.Argument(metavar="MAP", help="MovingAI map.", show_default=False)],
-    output: Annotated[Path, typer.Option(help="JSON file for the plan.", show_default=False)],
     robots: Annotated[int, typer.Option(min=1, help="Number of robots.")],
+    output: Annotated[Path, typer.Option(help="JSON file for the plan.")] = Path("plan.json"),
     scen: Annotated[Path | None, typer.Option(help="MovingAI scenario: starts and goals.")] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Time to plan; 0 (default): end with the first plan.")
@@ -109,6 +109,12 @@ def _one_shot(
     )
     built_s = time.perf_counter() - began
     bound = _lower_bound(problem)  # also says which goal has no path, before a search for a plan
+    if seconds and name == DEFAULT_PLANNER and not can_improve(problem):
+        typer.echo(
+            f"rce plan: --seconds {seconds:g} only serves to find a plan: the tables to improve one take too"
+            f" much memory for {robots} robots on this map",
+            err=True,
+        )
     began = time.perf_counter() - built_s
     joint = planner.plan(problem)
     found.append(time.perf_counter())

@@ -102,7 +102,7 @@ class LacamPlanner:
         joint = JointPlan(part.original(cells), complete, impossible=impossible)
         if self._on_first is not None and complete:
             self._on_first(joint)
-        if not complete or perf_counter() >= deadline or cells.shape[1] * len(steps) > _MAX_IMPROVED:
+        if not complete or perf_counter() >= deadline or not can_improve(problem):
             return joint
         seed = problem.seed
         while perf_counter() < began + _RESTARTS * problem.seconds:
@@ -183,6 +183,11 @@ def plan(
     return LacamPlanner(compiled=False).plan(
         PlanningProblem.of(graph, starts, goals, seed=seed, effort=effort)
     )
+
+
+def can_improve(problem: PlanningProblem) -> bool:
+    """Return whether a plan is improved in the time that is left, as tables of distances are small enough."""
+    return len(problem.starts) * len(np.unique(problem.graph.neighbours)) <= _MAX_IMPROVED
 
 
 def _cost(problem: PlanningProblem, joint: JointPlan) -> int:

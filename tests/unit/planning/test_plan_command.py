@@ -12,6 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from rce_fleet.offline.plan_command import plan
+from rce_fleet.planning import lacam
 from rce_fleet.planning.checker import check_plan
 from rce_fleet.planning.independent import DijkstraPlanner
 from rce_fleet.planning.lacam import LacamPlanner
@@ -52,6 +53,30 @@ def test_a_plan_is_written_and_is_right(files: tuple[Path, Path], tmp_path: Path
     assert check_plan(read_map(map_), report["paths"], starts=starts, goals=goals) == []
     assert report["cost"] == sum(len(path) - 1 for path in report["paths"]) >= report["lower_bound"] == 27
     assert report["makespan"] == max(len(path) - 1 for path in report["paths"])
+
+
+def test_time_that_improves_nothing_is_told(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tables of many robots on a large map would fill the memory."""
+    monkeypatch.setattr(lacam, "_MAX_IMPROVED", 4 * 18 - 1)
+    map_, scen = files
+    line = (map_, "--scen", scen, "--robots", 4, "--output", tmp_path / "plan.json")
+    code, said = run(*line, "--seconds", 60)
+    assert code == 0
+    assert "rce plan: --seconds 60 only serves to find a plan" in said
+    assert "for 4 robots on this map" in said
+    monkeypatch.setattr(lacam, "_MAX_IMPROVED", 4 * 18)
+    assert "--seconds" not in run(*line, "--seconds", 0.1)[1]
+
+
+def test_a_plan_has_a_file_if_none_is_named(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, said = run(files[0], "--lifelong", "--steps", 3, "--robots", 2, "--seed", 1)
+    assert (code, said[:10]) == (0, "plan.json:")
+    assert json.loads((tmp_path / "plan.json").read_text())["robots"] == 2
 
 
 def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path) -> None:
