@@ -83,6 +83,34 @@ def test_plans_keep_the_rules_on_random_maps(
     assert faults == []
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 10), moving=st.booleans())
+def test_plans_keep_to_lanes_costs_and_forbidden_cells(seed: int, count: int, moving: bool) -> None:
+    """Together: one-way moves, costs of all and of one robot, cells that one may not enter, and turns."""
+    grid, cells = drawn(seed, count, 0.15, rows=7, columns=8)
+    rng = np.random.default_rng(seed)
+    edges = [(cell, there) for cell in grid.free for there in grid.neighbours[cell] if there > cell]
+    closed = [edges[index] for index in rng.choice(len(edges), len(edges) // 8, replace=False)]
+    costs, own = rng.integers(1, 6, len(grid)), rng.integers(1, 6, len(grid))
+    starts, goals = cells[:count], [*cells[1:count], cells[0]] if count > 1 else cells[-1:]
+    barred = frozenset(cells[count : count + 4]) - set(goals)
+    problem = PlanningProblem.of(
+        PlanningGraph.from_grid(grid, costs=costs, closed=closed),
+        starts,
+        goals,
+        seed=seed,
+        effort=20_000,
+        forbidden={0: barred},
+        own_costs={count - 1: PlanningGraph.from_grid(grid, costs=own, closed=closed).costs},
+        motion=Motion(0.75, 0.5, (0,) * count) if moving else None,
+    )
+    joint = LacamPlanner(compiled=False).plan(problem)
+    paths = [joint.path(robot) for robot in range(count)]
+    ends = goals if joint.complete else None
+    assert check_plan(grid, paths, starts=starts, goals=ends, one_way=closed, rotations=False) == []
+    assert not barred & set(paths[0])
+
+
 def test_aisles_filled_with_robots_are_solved() -> None:
     cells = SHELVES.free
     starts, goals = cells[:40], cells[::-1][:40]
