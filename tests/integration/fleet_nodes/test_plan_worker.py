@@ -141,6 +141,30 @@ async def test_a_planner_that_raises_gives_an_empty_plan(caplog: pytest.LogCaptu
     assert "restarting" not in caplog.text
 
 
+JUMPS = """
+import sys
+from rce_fleet.nodes import plan_worker
+from rce_fleet.planning.planner import JointPlan
+
+class Jumps:
+    def plan(self, problem):
+        return JointPlan.of([problem.starts.tolist(), problem.goals.tolist()], complete=True)
+
+plan_worker.load_planner = lambda name: Jumps()
+plan_worker.serve(sys.stdin.buffer, sys.stdout.buffer)
+"""
+
+
+async def test_a_wrong_plan_of_another_package_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    """The log names planner, step and robot; no cell of the plan is handed on."""
+    async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", JUMPS), compiled=False) as worker:
+        result = await worker.compute(replace(request_of(1), planner="mine"))
+    assert (result.cells, result.complete) == ((), False)
+    (error,) = (record.getMessage() for record in caplog.records if record.levelno == logging.ERROR)
+    assert "the planner 'mine' failed in plan 1 for 3 robots: step 1: robot 0 goes from cell" in error
+    assert f"which is not beside it (robot 0 is {request_of(1).robots[0]}); lacam makes the plans" in error
+
+
 async def test_a_worker_ends_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also when the planner is killed and cannot end it; without loops, which it would load first."""
     monkeypatch.setenv("RCE_COMPILED", "no")
