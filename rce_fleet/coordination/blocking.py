@@ -68,7 +68,7 @@ class CellBlocking:
                 state.sensed.add(cell)
             self._witnesses[cell] = event.robot, self._dispatcher.now
 
-    def doubt(self, robot: str) -> None:
+    def free_latest_of(self, robot: str) -> None:
         """Free what a robot reported of late, and no other one since: it was not where its poses said."""
         since = self._dispatcher.now - DOUBTFUL_S
         for cell in sorted(self._state.sensed):

@@ -250,7 +250,7 @@ class FleetPlanner:
         """Note where a robot may be after its newest pose: also where it was, if the pose jumped."""
         if record.jumped_at == self._now:
             record.doubted |= self.state.ledger.overlapped(record.id)
-            self._blocking.doubt(record.id)
+            self._blocking.free_latest_of(record.id)
         elif record.doubted and record.is_steady(self.settings) and not self.state.ledger.length(record.id):
             record.doubted = frozenset()
         has_heard = record.pose_only and self._now - record.held_at >= self.settings.pose_only_settle
@@ -263,7 +263,7 @@ class FleetPlanner:
         if why != record.lost:
             self._modes.set_lost(record, why)
             if why:
-                self._blocking.doubt(record.id)
+                self._blocking.free_latest_of(record.id)
 
     def _distrust(self, record: RobotRecord) -> None:
         """Stop a robot whose pose jumped; it keeps its cells until its poses have agreed for a while."""
