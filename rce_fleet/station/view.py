@@ -71,6 +71,8 @@ class FleetView:
     """When the planner was heard last, monotonic seconds; None: never."""
     mode: str = "automatic"
     """The mode of the fleet: automatic, paused or stopped."""
+    planner_run: str = ""
+    """When the planner of the newest complete state was started, as it says."""
     _yaw: float = 0.0
     """Direction of the grid's columns, radians; it is in no ``fleet/FleetState``."""
     _map: dict[str, Any] | None = None
@@ -105,6 +107,7 @@ class FleetView:
             pending=_ascending(pending - self._pending),
             freed=_ascending((self._blocked | self._pending) - blocked - pending),
         )
+        self.planner_run = message.get("started", "")
         self._map, self._robots, self._blocked, self._pending = grid, robots, blocked, pending
         for robot in self.poses.keys() - robots.keys():
             del self.poses[robot]

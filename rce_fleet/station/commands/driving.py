@@ -48,28 +48,37 @@ class DriveGuard:
         self._number = -1
         self._at = float("-inf")
 
-    def take(self, frame: DriveFrame, now: float) -> tuple[float, float]:
+    def take(self, frame: DriveFrame, now: float, why_not: str = "") -> tuple[float, float]:
         """Handle a frame; return the speed and the turn rate to send, metres and radians per second.
 
         Args:
             frame: The frame.
             now: The station's clock, seconds.
+            why_not: Why the robot must stand, whatever the frame says; empty: it may drive.
         """
         if frame.number <= self._number:
             return self._stand("a frame came out of order")
         self._number, self._at = frame.number, now
         delay = now - frame.sent
         self._delays.append(delay)
-        if delay - min(self._delays) > LATE_S:
-            return self._stand("frames are late")
-        if frame.round_trip > ROUND_TRIP_S:
-            return self._stand(f"a round trip takes {frame.round_trip:.1f} s")
-        if not frame.held:
-            return self._stand("the dead-man's switch is released")
-        if not (isfinite(frame.speed) and isfinite(frame.turn_rate)):
-            return self._stand("the frame has no velocity")
-        self.reason = ""
+        self.reason = self._why_stand(frame, delay - min(self._delays), why_not)
+        if self.reason:
+            return 0.0, 0.0
         return _clip(frame.speed, MAX_SPEED), _clip(frame.turn_rate, MAX_TURN_RATE)
+
+    @staticmethod
+    def _why_stand(frame: DriveFrame, late: float, why_not: str) -> str:
+        if late > LATE_S:
+            return "frames are late"
+        if frame.round_trip > ROUND_TRIP_S:
+            return f"a round trip takes {frame.round_trip:.1f} s"
+        if why_not:
+            return why_not
+        if not frame.held:
+            return "the dead-man's switch is released"
+        if not (isfinite(frame.speed) and isfinite(frame.turn_rate)):
+            return "the frame has no velocity"
+        return ""
 
     def check(self, now: float) -> bool:
         """Return whether the robot must stop because no frame came for :data:`DEAD_S`."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
+from rce_fleet.station.commands.manual_watch import MANUAL, ManualWatch
 from rce_fleet.station.commands.owed_modes import OwedMode, OwedModes
 from rce_fleet.station.planner_client import PlannerError
 
@@ -17,12 +18,69 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-AUTOMATIC, MANUAL = "automatic", "manual"
+AUTOMATIC = "automatic"
 SHOWN_WAIT_S = 2.0
 """How long the view may take to show a mode that the planner accepted."""
 LOOK_EVERY_S = 2.0
 """How often robots are looked for that are manual although they are not driven any more."""
 _POLL_S = 0.05
+_ASK_AGAIN_S = 0.5
+
+
+class ManualHold:
+    """A robot that is in the mode ``manual`` while a person drives it.
+
+    Args:
+        fleet: Asks the planner.
+        view: Knows the robot's mode.
+        robot: The robot.
+        user: Who drives it.
+    """
+
+    def __init__(self, fleet: FleetLink, view: FleetView, robot: str, user: str) -> None:
+        self._fleet = fleet
+        self._view = view
+        self._robot = robot
+        self._user = user
+        self._watch = ManualWatch(view, robot)
+
+    async def begin(self) -> None:
+        """Ask the planner for ``manual``.
+
+        Raises:
+            PlannerError: The planner refuses, or does not answer.
+        """
+        watch = ManualWatch(self._view, self._robot)
+        await self._fleet.set_mode(self._robot, MANUAL, reason=f"driven by {self._user}", user=self._user)
+        watch.accept(_now())
+        self._watch = watch
+
+    @property
+    def why_not(self) -> str:
+        """Why the robot must stand now, for its driver; empty: it may drive."""
+        if self._watch.is_forgotten:
+            return "the planner was restarted and is asked for the mode manual"
+        mode = self.other_mode
+        return f"{self._robot} is {mode} now: another user or a program drives it" if mode else ""
+
+    @property
+    def other_mode(self) -> str:
+        """The mode that was set meanwhile, by a person or a program; empty: none."""
+        return self._watch.other_mode(_now()) if self._fleet.knows_modes else ""
+
+    async def until_other_mode(self) -> str:
+        """Wait until another mode is set, and return why driving ends.
+
+        A planner that was restarted is asked for ``manual`` again.
+        """
+        while not self.other_mode:
+            if self._watch.is_forgotten:
+                with suppress(PlannerError):  # it may not know the robot yet
+                    await self.begin()
+                await asyncio.sleep(_ASK_AGAIN_S)
+            else:
+                await asyncio.sleep(_POLL_S)
+        return self.why_not
 
 
 class ManualModes:
@@ -54,7 +112,7 @@ class ManualModes:
             await asyncio.sleep(LOOK_EVERY_S)
 
     @asynccontextmanager
-    async def manual(self, robot: str, user: str) -> AsyncIterator[None]:
+    async def manual(self, robot: str, user: str) -> AsyncIterator[ManualHold]:
         """Have a robot in the mode ``manual`` while the block runs, then in the mode that it had before.
 
         A mode that is set meanwhile, by a person or a program, stays. If the planner does not set the mode
@@ -70,17 +128,16 @@ class ManualModes:
         async with self._settling:
             self._driven.add(robot)
         try:
-            before = self._view.mode_of(robot)
             await self._owe(robot, user)
+            hold = ManualHold(self._fleet, self._view, robot, user)
             is_accepted = False
             try:
-                await self._fleet.set_mode(robot, MANUAL, reason=f"driven by {user}", user=user)
+                await hold.begin()
                 is_accepted = True
-                yield
+                yield hold
             finally:
-                shown = self._view.mode_of(robot)
-                # The view may not show manual yet. It shows the mode of before then, which may be set again.
-                if shown == MANUAL or (is_accepted and shown == before):
+                is_manual = is_accepted or self._view.mode_of(robot) == MANUAL
+                if is_manual and hold.other_mode in ("", self._owed_mode(robot)):
                     await self._restore(robot)
                 else:
                     self._owed.forget(robot)
@@ -96,6 +153,11 @@ class ManualModes:
         if own != MANUAL:
             self._owed.owe(robot, OwedMode(mode=own, user=user))
             await self._save()
+
+    def _owed_mode(self, robot: str) -> str:
+        """Return the mode that a robot shall have again; empty: none is owed."""
+        owed = self._owed.get(robot)
+        return "" if owed is None else owed.mode
 
     async def _settle(self, robot: str) -> None:
         """Restore the mode of a robot that is not driven, if it still is manual."""
@@ -135,3 +197,7 @@ class ManualModes:
             await asyncio.to_thread(self._owed.save)
         except OSError as error:
             _log.error("the modes of robots are not kept for a restart of the station: %s", error)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -25,7 +25,7 @@ from rce_fleet.station.planner_client import PlannerError
 
 if TYPE_CHECKING:
     from rce_fleet.station.commands.control import RobotControl
-    from rce_fleet.station.commands.manual_mode import ManualModes
+    from rce_fleet.station.commands.manual_mode import ManualHold, ManualModes
     from rce_fleet.station.commands.sources import CommandSender
     from rce_fleet.station.fleet_api import FleetApi
 
@@ -190,7 +190,8 @@ class ControlRoutes:
         """Let a page drive a robot over a WebSocket, until it disconnects.
 
         The page sends frames (:class:`DriveFrame`) and gets an answer to each: its number, what the robot was
-        told, and why it stands. The robot stops if no frame comes for 0.4 s.
+        told, and why it stands. The robot stops if no frame comes for 0.4 s. Driving ends when the robot is
+        not manual any more.
         """
         robot = request.match_info["robot"]
         refusal = self._access.control_refusal(request, "drive", robot)
@@ -210,9 +211,12 @@ class ControlRoutes:
         ended = asyncio.get_running_loop().create_future()
         self._drives.add(ended)
         try:
-            async with self._modes.manual(robot, user), self._sender(request, control, robot) as sender:
+            async with (
+                self._modes.manual(robot, user) as hold,
+                self._sender(request, control, robot) as sender,
+            ):
                 may_drive = partial(self._access.is_still_allowed, request, to_control=True)
-                await _drive(request, socket, sender, may_drive, self._ending)
+                await _drive(request, socket, sender, hold, may_drive, self._ending)
         except (CommandError, PlannerError) as error:
             await _refuse(request, socket, str(error))
         finally:
@@ -251,44 +255,58 @@ async def _drive(
     request: web.Request,
     socket: web.WebSocketResponse,
     sender: CommandSender,
+    hold: ManualHold,
     may_drive: Callable[[], Awaitable[bool]],
     ending: asyncio.Event,
 ) -> None:
-    """Pass frames on until the page leaves, its user may not drive any more, or the station ends."""
-    guard, loop = DriveGuard(), asyncio.get_running_loop()
-
-    async def watch() -> None:
-        while True:
-            await asyncio.sleep(DEAD_S / 4)
-            if guard.check(loop.time()):
-                sender.send(velocity_message(0.0, 0.0))
-
-    async def check_login() -> None:
-        while True:
-            await asyncio.sleep(CHECK_S)
-            if not await may_drive():
-                break
-
-    reader = asyncio.create_task(_pass_on(request, socket, sender, guard))
-    watcher, checker = asyncio.create_task(watch()), asyncio.create_task(check_login())
-    end = asyncio.create_task(ending.wait())
+    """Pass frames on until the page leaves, the robot has another mode, or user or station end."""
+    guard = DriveGuard()
+    reader = asyncio.create_task(_pass_on(request, socket, sender, hold, guard))
+    watcher, checker = asyncio.create_task(_stop(sender, hold, guard)), asyncio.create_task(_check(may_drive))
+    other, end = asyncio.create_task(hold.until_other_mode()), asyncio.create_task(ending.wait())
     try:
-        await asyncio.wait([reader, checker, end], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([reader, checker, other, end], return_when=asyncio.FIRST_COMPLETED)
         if reader.done():
             reader.result()
             return
         if end.done():
             return
-        checker.result()
+        if checker.done():
+            checker.result()
+        why = other.result() if other.done() else ""
     finally:
-        await cancel_and_wait(reader, watcher, checker, end)
+        await cancel_and_wait(reader, watcher, checker, other, end)
     sender.send(velocity_message(0.0, 0.0))
-    text = "you may not drive this robot any more; log in again"
-    await close_socket(request, socket, code=WSCloseCode.POLICY_VIOLATION, reason=text)
+    if why:
+        await _refuse(request, socket, why)
+    else:
+        text = "you may not drive this robot any more; log in again"
+        await close_socket(request, socket, code=WSCloseCode.POLICY_VIOLATION, reason=text)
+
+
+async def _stop(sender: CommandSender, hold: ManualHold, guard: DriveGuard) -> None:
+    """Stop the robot while frames are missing or the planner may drive it, until cancelled."""
+    loop = asyncio.get_running_loop()
+    while True:
+        await asyncio.sleep(DEAD_S / 4)
+        if guard.check(loop.time()) or hold.why_not:
+            sender.send(velocity_message(0.0, 0.0))
+
+
+async def _check(may_drive: Callable[[], Awaitable[bool]]) -> None:
+    """Wait until the user may not drive any more."""
+    while True:
+        await asyncio.sleep(CHECK_S)
+        if not await may_drive():
+            break
 
 
 async def _pass_on(
-    request: web.Request, socket: web.WebSocketResponse, sender: CommandSender, guard: DriveGuard
+    request: web.Request,
+    socket: web.WebSocketResponse,
+    sender: CommandSender,
+    hold: ManualHold,
+    guard: DriveGuard,
 ) -> None:
     """Send the robot what the frames of a page say, until the page leaves."""
     loop = asyncio.get_running_loop()
@@ -302,7 +320,7 @@ async def _pass_on(
                 sender.send(velocity_message(0.0, 0.0))
                 await _refuse(request, socket, f"not a frame: {error.errors()[0]['msg']}")
                 break
-            speed, turn_rate = guard.take(frame, loop.time())
+            speed, turn_rate = guard.take(frame, loop.time(), hold.why_not)
             sender.send(velocity_message(speed, turn_rate))
             answer = {"number": frame.number, "speed": speed, "turn_rate": turn_rate, "reason": guard.reason}
             await socket.send_str(json.dumps(answer))

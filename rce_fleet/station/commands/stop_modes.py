@@ -13,7 +13,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rce_fleet.station.commands.manual_mode import AUTOMATIC, MANUAL
+from rce_fleet.station.commands.manual_mode import AUTOMATIC
+from rce_fleet.station.commands.manual_watch import MANUAL
 from rce_fleet.station.commands.owed_modes import OwedMode, OwedModes
 from rce_fleet.station.planner_client import PlannerError, PlannerUnavailableError
 from rce_fleet.station.private_files import fleet_file

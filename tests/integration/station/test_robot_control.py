@@ -41,7 +41,11 @@ LIMIT_S = 60
 class RecordingFleet:
     """Stands for the planner: its services are not what is tested here."""
 
-    def __init__(self) -> None:
+    knows_modes = True
+
+    def __init__(self, view: FleetView) -> None:
+        self.view = view
+        self.run = ""
         self.modes: list[tuple[str, str]] = []
         self.refuses: set[str] = set()
         self.events: list[str] = []
@@ -53,9 +57,17 @@ class RecordingFleet:
         if mode in self.refuses:
             raise PlannerError(f"{mode} is refused")
         self.modes.append((robot, mode))
+        self.show(robot, mode, self.run)
         if mode != "manual":
             await self.may_restore.wait()
         return ""
+
+    def show(self, robot: str, mode: str, run: str = "") -> None:
+        """Have the view show another mode of a robot, of this run of the planner."""
+        known = self.view.state
+        assert known is not None
+        shown = [{**one, "mode": mode} if one["id"] == robot else one for one in known["robots"]]
+        self.view.on_state({**known, "robots": shown, "mode": self.view.mode, "started": run})
 
     def take_event(self, text: str, tone: str) -> None:
         assert tone == "bad"
@@ -106,7 +118,7 @@ async def site(authenticator: Authenticator | None = None, robots: int = 2) -> A
     view = FleetView()
     feed = Feed(view)
     feed.on_change(view.on_state(state(*(robot(f"Robot{number}") for number in range(1, robots + 1)))))
-    fleet = RecordingFleet()
+    fleet = RecordingFleet(view)
     async with (
         Core(port=0) as core,
         Node("hardware", argv=[], master_uri=core.uri, types=TYPES) as node,
@@ -310,6 +322,57 @@ async def test_a_mode_that_is_set_while_driving_stays() -> None:
         assert made.fleet.modes == [("Robot1", "manual")]
 
 
+async def _drive_to_the_end(page: ClientWebSocketResponse) -> list[str]:
+    """Send frames until the station closes the drive; return the reasons and errors that it told."""
+    told = []
+    async with asyncio.timeout(LIMIT_S):
+        for number in range(1, 1_000_000):
+            frame = {"number": number, "sent": asyncio.get_running_loop().time(), "held": True}
+            with contextlib.suppress(ConnectionError):  # the station has closed it: read on
+                await page.send_str(json.dumps({**frame, "speed": 0.2}))
+            message = await page.receive()
+            if message.type is not WSMsgType.TEXT:
+                break
+            answer = json.loads(message.data)
+            told.append(answer.get("reason") or answer.get("error", ""))
+            await asyncio.sleep(0.01)
+    return told
+
+
+@pytest.mark.parametrize("mode", ["automatic", "paused"])
+async def test_driving_ends_when_another_mode_is_set(mode: str) -> None:
+    """As when another operator resumes the robot: the planner would drive it, too."""
+    async with site() as made:
+        made.view.on_state(state(robot("Robot1", mode="automatic")))
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            await _frame(page, 0)
+            made.fleet.show("Robot1", mode)
+            told = await _drive_to_the_end(page)
+        assert f"Robot1 is {mode} now" in told[-1]
+        await made.until(lambda: not made.control.driven)
+        await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
+        assert made.view.mode_of("Robot1") == mode
+
+
+async def test_a_restarted_planner_gets_the_mode_manual_again() -> None:
+    """The robot stands until the planner, which begins with automatic, has accepted it."""
+    async with site() as made:
+        made.view.on_state(state(robot("Robot1", mode="paused")))
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            await _frame(page, 0)
+            made.fleet.refuses.add("manual")
+            made.fleet.show("Robot1", "automatic", run="2")
+            await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
+            assert "was restarted" in (await _frame(page, 1))["reason"]
+            made.fleet.run = "2"
+            made.fleet.refuses.clear()
+            await made.until(lambda: len(made.fleet.modes) > 1)
+            assert made.fleet.modes == [("Robot1", "manual")] * 2
+            assert (await _frame(page, 2))["speed"] == 0.2
+        await made.until(lambda: not made.control.driven)
+        assert made.fleet.modes[-1] == ("Robot1", "paused")
+
+
 async def test_a_robot_whose_manual_mode_is_refused_keeps_its_mode() -> None:
     async with site() as made:
         made.fleet.refuses.add("manual")
@@ -355,14 +418,7 @@ async def test_driving_ends_with_the_permission(
     async with site() as made, made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
         assert (await _frame(page, 0))["speed"] == 0.2
         made.login.user = user
-        async with asyncio.timeout(LIMIT_S):
-            for number in range(1, 1_000_000):
-                frame = {"number": number, "sent": asyncio.get_running_loop().time(), "held": True}
-                with contextlib.suppress(ConnectionError):  # the station has closed it: read on
-                    await page.send_str(json.dumps({**frame, "speed": 0.2}))
-                if (await page.receive()).type is not WSMsgType.TEXT:
-                    break
-                await asyncio.sleep(0.01)
+        await _drive_to_the_end(page)
         assert page.close_code == WSCloseCode.POLICY_VIOLATION
         await made.until(lambda: not made.control.driven)
         await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
