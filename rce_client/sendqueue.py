@@ -1,4 +1,7 @@
-"""What waits to be sent to the engine: requests first, then topics in turn. Pure, but for one event."""
+"""What waits to be sent to the engine: requests, then small messages, then larger ones, topics in turn.
+
+Pure, but for one event.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,10 @@ class QueueLimits:
     """Messages of one topic; beyond it, the oldest is dropped."""
     topic_bytes: int = 16 << 20
     """Bytes of the messages of one topic; beyond it, the oldest are dropped."""
+    small_bytes: int = 4 << 10
+    """Messages up to this size, such as a velocity, go before larger ones of other topics."""
+    burst_bytes: int = 256 << 10
+    """Bytes of small messages after which a larger one is sent."""
     control_messages: int = 1024
     """Service messages; beyond it, calls fail. Requests are always accepted."""
 
@@ -50,19 +57,23 @@ class QueuedMessage:
 class SendQueue:
     """Two lanes: control, in order and complete; data, one queue per interface that forgets its oldest.
 
-    Invariant: ``_topics`` holds no empty queue; its order is the order of turns.
+    Invariant: a topic's queue is in ``_small`` or ``_large`` exactly while it is not empty; in which one is
+    looked at when its turn comes. Their order is the order of turns.
     """
 
     def __init__(self, limits: QueueLimits) -> None:
         self._limits = limits
         self._control: deque[QueuedMessage] = deque()
-        self._topics: OrderedDict[str, BoundedQueue[QueuedMessage]] = OrderedDict()
+        self._small: OrderedDict[str, BoundedQueue[QueuedMessage]] = OrderedDict()
+        self._large: OrderedDict[str, BoundedQueue[QueuedMessage]] = OrderedDict()
+        self._burst = 0
+        """Bytes of small messages since the last larger one."""
         self._filled = asyncio.Event()
         self.dropped: Counter[str] = Counter()
         """Interface tag to the number of its messages that were thrown away."""
 
     def __bool__(self) -> bool:
-        return bool(self._control or self._topics)
+        return bool(self._control or self._small or self._large)
 
     @property
     def full(self) -> bool:
@@ -76,26 +87,42 @@ class SendQueue:
 
     def put_data(self, tag: str, queued: QueuedMessage) -> None:
         """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
-        queue = self._topics.get(tag)
+        queue = self._small.get(tag) or self._large.get(tag)
         if queue is None:
             limits = self._limits
-            queue = self._topics[tag] = BoundedQueue(
+            queue = BoundedQueue(
                 limits.topic_messages, limits.topic_bytes, on_drop=lambda _: self.dropped.update((tag,))
             )
-        queue.put(queued, queued.size, queued.key)
+            queue.put(queued, queued.size, queued.key)
+            self._enlist(tag, queue)
+        else:
+            queue.put(queued, queued.size, queued.key)
         self._filled.set()
 
     def pop(self) -> QueuedMessage | None:
         """Remove and return what is to be sent next; None if nothing waits."""
         if self._control:
             return self._control.popleft()
-        if not self._topics:
+        while self._small and not (self._large and self._burst >= self._limits.burst_bytes):
+            tag, queue = self._small.popitem(last=False)
+            if queue.head_size <= self._limits.small_bytes:
+                self._burst += queue.head_size
+                return self._take(tag, queue)
+            self._enlist(tag, queue)
+        if not self._large:
             return None
-        tag, queue = self._topics.popitem(last=False)
+        self._burst = 0
+        return self._take(*self._large.popitem(last=False))
+
+    def _take(self, tag: str, queue: BoundedQueue[QueuedMessage]) -> QueuedMessage:
         queued = queue.take()
         if queue:
-            self._topics[tag] = queue
+            self._enlist(tag, queue)
         return queued
+
+    def _enlist(self, tag: str, queue: BoundedQueue[QueuedMessage]) -> None:
+        lane = self._small if queue.head_size <= self._limits.small_bytes else self._large
+        lane[tag] = queue
 
     async def get(self) -> QueuedMessage:
         """Wait until there is something to send; remove and return it. Cancelling removes nothing."""

@@ -2,8 +2,9 @@
 
 * The *control lane* carries small, urgent messages: ``ST``, ``ER``, small service messages. It always goes
   first and never drops messages: when it is full, the sender is told.
-* The *data lane* holds one queue per interface. Interfaces take turns by deficit round robin, so that a
-  stream of 10 MB images leaves room for every small message that arrives meanwhile.
+* The *data lane* holds one queue per interface. Interfaces whose oldest message is small, such as a velocity,
+  go first, as in the links of the engine. The others take turns by deficit round robin, one after each
+  quantum of small messages, so that none is starved.
 
 A robot that stops reading fills only its own queues. A topic's queue then drops its oldest message for every
 new one and counts it; a service's queue refuses, so that the caller gets an error.
@@ -40,24 +41,28 @@ class OutboxLimits:
     control_messages: int = 4096
     control_bytes: int = 8 << 20
     quantum: int = 256 << 10
-    """Bytes an interface may send per turn while others wait."""
+    """Bytes an interface may send per turn while others wait; also of small messages before a larger one."""
+    small_bytes: int = 4 << 10
+    """Messages up to this size go before larger ones of other interfaces."""
 
 
 class _Flow:
     """The queue of one interface in the data lane. Latched messages are kept in it, by their sources.
 
     Attributes:
+        ring: In which it waits for its turn; None: it is empty.
         tag: Of the interface.
         queue: The waiting messages, oldest first.
         credit: Bytes that it may send now.
         latched: By source, the bytes that its latched message counts: none if they are counted elsewhere.
     """
 
-    __slots__ = ("credit", "latched", "queue", "tag")
+    __slots__ = ("credit", "latched", "queue", "ring", "tag")
 
     def __init__(self, tag: str, queue: BoundedQueue[Queued]) -> None:
         self.tag = tag
         self.queue = queue
+        self.ring: deque[_Flow] | None = None
         self.credit = 0
         self.latched: dict[Hashable, int] = {}
 
@@ -65,8 +70,9 @@ class _Flow:
 class Outbox:
     """The queues between a robot's interfaces and its connection.
 
-    Invariants: a flow is in ``_ring`` exactly while it holds messages; ``_data_bytes`` is the sum of the
-    flows' bytes; no queue is over its limits by more than one message.
+    Invariants: a flow is in ``_small`` or ``_ring`` exactly while it holds messages; in which one is looked at
+    when its turn comes. ``_data_bytes`` is the sum of the flows' bytes; no queue is over its limits by more
+    than one message.
     """
 
     def __init__(self, limits: OutboxLimits = OutboxLimits(), dropped: Counter[str] | None = None) -> None:
@@ -76,14 +82,17 @@ class Outbox:
         self._states: dict[str, Queued] = {}
         self._state_bytes = 0
         self._flows: dict[str, _Flow] = {}
+        self._small: deque[_Flow] = deque()
         self._ring: deque[_Flow] = deque()
+        self._burst = 0
+        """Bytes of small messages since the last larger one."""
         self._data_bytes = 0
         self._latched_bytes = 0
         self.dropped: Counter[str] = Counter() if dropped is None else dropped
         """Interface tag to the number of its dropped messages; may outlive the outbox."""
 
     def __bool__(self) -> bool:
-        return bool(self._states or self._control or self._ring)
+        return bool(self._states or self._control or self._small or self._ring)
 
     @property
     def bytes(self) -> int:
@@ -128,10 +137,9 @@ class Outbox:
             return False
         while self._data_bytes + size > self._limits.total_bytes and self._drop_of_largest_topic():
             pass
-        if not flow.queue:
-            self._ring.append(flow)
         flow.queue.put(message, size)
         self._data_bytes += size
+        self._enlist(flow)
         return True
 
     def put_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
@@ -150,12 +158,11 @@ class Outbox:
         if flow.queue.remove_kept(source):
             self._latched_bytes -= flow.latched[source]
             self.dropped[tag] += bool(source)
-        elif not flow.queue:
-            self._ring.append(flow)
         size = message.size
         flow.queue.put(message, size, source)
         flow.latched[source] = 0 if shared else size
         self._latched_bytes += flow.latched[source]
+        self._enlist(flow)
 
     def drop_latched(self, tag: str, source: Hashable) -> None:
         """Drop the unsent latched message of a source."""
@@ -175,15 +182,13 @@ class Outbox:
             message, size = self._control.popleft()
             self._control_bytes -= size
             return message
-        if self._ring:
-            return self._pop_data()
-        return None
+        return self._pop_data()
 
     def discard(self, tag: str) -> None:
         """Drop the messages of a removed interface, except the statement of its removal."""
         flow = self._flows.pop(tag, None)
         if flow is not None and flow.queue:
-            self._ring.remove(flow)
+            self._leave(flow)
             self._data_bytes -= flow.queue.droppable_bytes
             self._latched_bytes -= sum(flow.latched.values())
 
@@ -195,16 +200,17 @@ class Outbox:
         goal = self.bytes - size
         while self.bytes > goal and self._drop_of_largest_topic():
             pass
-        for flow in list(self._ring):
+        for flow in self._waiting():
             for source, counted in list(flow.latched.items()):
                 if source != "" and counted and self.bytes > goal:
                     self.drop_latched(flow.tag, source)
 
     def clear(self) -> None:
         """Drop all messages."""
-        for flow in self._ring:
+        for flow in self._waiting():
             self.dropped[flow.tag] += len(flow.queue)
         self._flows.clear()
+        self._small.clear()
         self._ring.clear()
         self._control.clear()
         self._states.clear()
@@ -234,7 +240,7 @@ class Outbox:
     def _drop_of_largest_topic(self) -> bool:
         topics = [
             flow
-            for flow in self._ring
+            for flow in self._waiting()
             if flow.queue.policy is OverflowPolicy.DROP_OLDEST and flow.queue.droppable
         ]
         if topics:
@@ -245,27 +251,63 @@ class Outbox:
             self._leave_if_empty(flow)
         return bool(topics)
 
-    def _leave_if_empty(self, flow: _Flow) -> None:
-        if not flow.queue:
-            self._ring.remove(flow)
+    def _waiting(self) -> list[_Flow]:
+        return [*self._small, *self._ring]
+
+    def _enlist(self, flow: _Flow) -> None:
+        """Have a flow wait for its turn, unless it does."""
+        if flow.ring is None:
+            flow.ring = self._small if flow.queue.head_size <= self._limits.small_bytes else self._ring
+            flow.ring.append(flow)
+
+    @staticmethod
+    def _leave(flow: _Flow) -> None:
+        if flow.ring is not None:
+            flow.ring.remove(flow)
+            flow.ring = None
             flow.credit = 0
 
-    def _pop_data(self) -> Queued:
-        ring = self._ring
-        while True:
-            flow = ring[0]
-            if len(ring) == 1 or flow.queue.head_size <= flow.credit:
-                break
-            flow.credit += self._limits.quantum
-            ring.rotate(-1)
+    def _leave_if_empty(self, flow: _Flow) -> None:
+        if not flow.queue:
+            self._leave(flow)
+
+    def _pop_data(self) -> Queued | None:
+        flow = self._next_small() or self._next_large()
+        if flow is None:
+            return None
         size, source = flow.queue.head_size, flow.queue.kept_head
         message = flow.queue.take()
         if source is None:
             self._data_bytes -= size
         else:
             self._latched_bytes -= flow.latched.pop(source)
-        flow.credit = max(0, flow.credit - size)
-        if not flow.queue:
-            ring.popleft()
-            flow.credit = 0
+        if flow.ring is self._small:
+            self._burst += size
+            self._leave(flow)
+            if flow.queue:
+                self._enlist(flow)
+        else:
+            self._burst = 0
+            flow.credit = max(0, flow.credit - size)
+            self._leave_if_empty(flow)
         return message
+
+    def _next_small(self) -> _Flow | None:
+        """Return the flow whose small message is sent next; None if it is the turn of a larger one."""
+        while self._small and not (self._ring and self._burst >= self._limits.quantum):
+            flow = self._small[0]
+            if flow.queue.head_size <= self._limits.small_bytes:
+                return flow
+            self._leave(flow)
+            self._enlist(flow)
+        return None
+
+    def _next_large(self) -> _Flow | None:
+        ring = self._ring
+        while ring:
+            flow = ring[0]
+            if len(ring) == 1 or flow.queue.head_size <= flow.credit:
+                return flow
+            flow.credit += self._limits.quantum
+            ring.rotate(-1)
+        return None

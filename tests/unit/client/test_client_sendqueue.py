@@ -31,6 +31,21 @@ async def test_requests_go_first_and_topics_take_turns() -> None:
     assert not queue
 
 
+async def test_small_messages_pass_large_ones() -> None:
+    """As a velocity does; those of one topic stay in order, and large ones are not starved."""
+    queue = SendQueue(QueueLimits(small_bytes=4, burst_bytes=8))
+    for tag in "ab":
+        queue.put_data(tag, queued(f"{tag} image"))
+    for text in ("1", "2 image", "3"):
+        queue.put_data("scan", queued(text))
+    for text in ("v1", "v2", "v3", "v4", "v5"):
+        queue.put_data("velocity", queued(text))
+    sent = drain(queue)
+    assert sent[:6] == ["1", "v1", "v2", "v3", "v4", "a image"]
+    assert [text for text in sent if text[0] in "123"] == ["1", "2 image", "3"]
+    assert sorted(sent[6:]) == ["2 image", "3", "b image", "v5"]
+
+
 async def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
     queue = SendQueue(QueueLimits(topic_messages=2))
     for text in ("1", "2", "3"):

@@ -136,6 +136,39 @@ def test_small_messages_pass_large_ones() -> None:
     assert drain(outbox)[:2] == ["cancel", "pose"]
 
 
+def test_small_messages_pass_large_ones_that_have_credit() -> None:
+    """As a velocity does, also if the images of two cameras have waited for long."""
+    outbox = Outbox(OutboxLimits(quantum=1000))
+    for camera in ("left", "right"):
+        for number in range(2):
+            outbox.put_data(camera, message(f"{camera}{number}", 20_000))
+    first = outbox.pop()
+    assert first is not None
+    outbox.put_data("velocity", message("drive"))
+    assert [text_of(first), drain(outbox)[0]] == ["left0", "drive"]
+
+
+def test_small_messages_starve_no_large_one() -> None:
+    """A larger one has its turn after each quantum of small ones."""
+    outbox = Outbox(OutboxLimits(quantum=1000))
+    outbox.put_data("image", message("image", 10_000))
+    texts = []
+    for number in range(40):
+        outbox.put_data("pose", message(f"pose{number}", 100))
+        item = outbox.pop()
+        assert item is not None
+        texts.append(text_of(item))
+    assert texts.count("image") == 1
+
+
+def test_messages_of_one_interface_keep_their_order() -> None:
+    """Its small messages do not pass its larger ones."""
+    outbox = Outbox()
+    for number, size in enumerate((10, 10_000, 10, 10_000)):
+        outbox.put_data("scan", message(str(number), size))
+    assert drain(outbox) == list("0123")
+
+
 def test_discard_forgets_an_interface() -> None:
     outbox = Outbox()
     outbox.put_data("gone", message("x"))
