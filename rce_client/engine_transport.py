@@ -223,17 +223,20 @@ class EngineTransport:
             self._listener.on_lost(await self._use(socket))
             await asyncio.sleep(pauses.next())
 
-    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+    def post_data(
+        self, tag: str, frames: Sequence[Frame], key: str | None = None, queue_size: int | None = None
+    ) -> bool:
         """Send a topic's message when its turn comes; return False if there is no connection.
 
         Args:
             tag: The interface.
             frames: The message's frames.
             key: A queued message with a key is dropped only for a newer one of the same key.
+            queue_size: Messages of the topic that may wait; None: as many as the limits allow.
         """
         if self.connected:
             self._idle.clear()
-            self._queue.put_data(tag, QueuedMessage.of(frames, key))
+            self._queue.put_data(tag, QueuedMessage.of(frames, key), queue_size)
         return self.connected
 
     def post_control(self, frames: Sequence[Frame]) -> bool:

@@ -23,13 +23,16 @@ M_contra = TypeVar("M_contra", contravariant=True)
 class InterfaceOwner(Protocol):
     """The connection that an interface belongs to, as the interface uses it."""
 
-    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+    def post_data(
+        self, tag: str, frames: Sequence[Frame], key: str | None = None, queue_size: int | None = None
+    ) -> bool:
         """Send a topic's message.
 
         Args:
             tag: The interface.
             frames: The message's frames.
             key: A queued message with a key is dropped only for a newer one of the same key.
+            queue_size: Messages of the topic that may wait; None: as many as the limits allow.
 
         Returns:
             Whether there is a connection; without one nothing is sent.

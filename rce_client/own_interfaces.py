@@ -35,12 +35,16 @@ class OwnInterfaces:
     _session: Session
 
     @overload
-    async def publisher(self, tag: str, message_type: str) -> Publisher[Json]: ...
+    async def publisher(
+        self, tag: str, message_type: str, *, queue_size: int | None = ...
+    ) -> Publisher[Json]: ...
     @overload
     async def publisher(
-        self, tag: str, message_type: str, *, raw: Literal[True]
+        self, tag: str, message_type: str, *, raw: Literal[True], queue_size: int | None = ...
     ) -> Publisher[Serialized]: ...
-    async def publisher(self, tag: str, message_type: str, *, raw: bool = False) -> Publisher[Any]:
+    async def publisher(
+        self, tag: str, message_type: str, *, raw: bool = False, queue_size: int | None = None
+    ) -> Publisher[Any]:
         """Create an interface of this robot that sends messages.
 
         Cancelling does not withdraw the request: the engine creates the interface. Call the method again with
@@ -50,6 +54,8 @@ class OwnInterfaces:
             tag: Interface tag.
             message_type: Message type, ``package/Type``.
             raw: Messages are serialized ROS messages (a Forwarder) instead of objects (a Converter).
+            queue_size: How many messages may wait on a slow connection; a full queue drops the oldest. 1 is
+                for commands of which only the newest counts. None: as many as the connection's limits allow.
 
         Raises:
             InterfaceError: This program already has an interface with this tag.
@@ -64,7 +70,9 @@ class OwnInterfaces:
             names.publish({"data": "Ada"})
             ```
         """
-        return await self._open(Publisher[Any](self._session, tag, message_type, raw=raw))
+        return await self._open(
+            Publisher[Any](self._session, tag, message_type, raw=raw, queue_size=queue_size)
+        )
 
     @overload
     async def subscriber(

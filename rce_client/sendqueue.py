@@ -85,13 +85,21 @@ class SendQueue:
         self._control.append(queued)
         self._filled.set()
 
-    def put_data(self, tag: str, queued: QueuedMessage) -> None:
-        """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
+    def put_data(self, tag: str, queued: QueuedMessage, queue_size: int | None = None) -> None:
+        """Add a message of a topic; where the queue is full the oldest is dropped and counted.
+
+        Args:
+            tag: The interface.
+            queued: The message.
+            queue_size: Messages of the topic that may wait; None: as many as the limits allow.
+        """
         queue = self._small.get(tag) or self._large.get(tag)
         if queue is None:
             limits = self._limits
             queue = BoundedQueue(
-                limits.topic_messages, limits.topic_bytes, on_drop=lambda _: self.dropped.update((tag,))
+                queue_size or limits.topic_messages,
+                limits.topic_bytes,
+                on_drop=lambda _: self.dropped.update((tag,)),
             )
             queue.put(queued, queued.size, queued.key)
             self._enlist(tag, queue)

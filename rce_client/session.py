@@ -225,9 +225,11 @@ class Session:
 
     # What the interfaces use: rce_client.interfaces.InterfaceOwner
 
-    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+    def post_data(
+        self, tag: str, frames: Sequence[Frame], key: str | None = None, queue_size: int | None = None
+    ) -> bool:
         """Send a topic's message; return False if there is no connection."""
-        return self.transport.post_data(tag, frames, key)
+        return self.transport.post_data(tag, frames, key, queue_size)
 
     def is_active(self, tag: str) -> bool:
         """Return whether an interface is joined with a peer."""

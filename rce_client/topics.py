@@ -35,8 +35,17 @@ class Publisher(ClientInterface, Generic[M]):
 
     role = Role.SUBSCRIBER
 
-    def __init__(self, owner: InterfaceOwner, tag: str, message_type: str, *, raw: bool) -> None:
+    def __init__(
+        self,
+        owner: InterfaceOwner,
+        tag: str,
+        message_type: str,
+        *,
+        raw: bool,
+        queue_size: int | None = None,
+    ) -> None:
         super().__init__(owner, tag, message_type, raw=raw)
+        self._queue_size = queue_size
         self._latched: dict[str, M] = {}
         self._on_demand: Callable[[bool], None] | None = None
 
@@ -83,7 +92,7 @@ class Publisher(ClientInterface, Generic[M]):
             ```
         """
         if not latch:
-            return self._owner.post_data(self.tag, self._frames(message))
+            return self._owner.post_data(self.tag, self._frames(message), queue_size=self._queue_size)
         frames = self._latched_frames(message, latch)
         self._latched[latch] = message
         return self._owner.is_active(self.tag) and self._owner.post_data(self.tag, frames, latch)

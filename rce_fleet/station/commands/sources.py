@@ -115,7 +115,9 @@ class EngineCommandSource(CommandSource):
         tag = command.interface_tag(robot)
         endpoints = await self.find(tag, f"{robot} does not offer {command.topic}")
         try:
-            publisher: Publisher[dict[str, Any]] = await connection.publisher(tag, command.type_name)
+            publisher: Publisher[dict[str, Any]] = await connection.publisher(
+                tag, command.type_name, queue_size=1
+            )
         except ClientError as error:
             raise CommandError(f"the engine cannot be reached: {error}") from error
         sender = _EngineSender(self, connection, publisher, latch="1" if command.is_latched else "")

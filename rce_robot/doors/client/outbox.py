@@ -70,9 +70,9 @@ class _Flow:
 class Outbox:
     """The queues between a robot's interfaces and its connection.
 
-    Invariants: a flow is in ``_small`` or ``_ring`` exactly while it holds messages; in which one is looked at
-    when its turn comes. ``_data_bytes`` is the sum of the flows' bytes; no queue is over its limits by more
-    than one message.
+    Invariants: a flow is in ``_small`` or ``_ring`` exactly while it holds messages; in which of them is
+    looked at when its turn comes. ``_data_bytes`` is the sum of the flows' bytes; no queue is over its limits
+    by more than one message.
     """
 
     def __init__(self, limits: OutboxLimits = OutboxLimits(), dropped: Counter[str] | None = None) -> None:

@@ -35,7 +35,9 @@ class Owner:
         assert tag == "say"
         return self.active
 
-    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+    def post_data(
+        self, tag: str, frames: Sequence[Frame], key: str | None = None, queue_size: int | None = None
+    ) -> bool:
         assert tag == "say"
         assert frames
         self.sent.append(key)

@@ -54,6 +54,14 @@ async def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
     assert queue.dropped == {"a": 1}
 
 
+async def test_a_queue_of_one_keeps_the_newest() -> None:
+    queue = SendQueue(QueueLimits())
+    for text in ("1", "2", "3"):
+        queue.put_data("velocity", queued(text), queue_size=1)
+        queue.put_data("pose", queued(text))
+    assert drain(queue) == ["3", "1", "2", "3"]
+
+
 async def test_bytes_are_limited_too_but_one_message_is_always_taken() -> None:
     queue = SendQueue(QueueLimits(topic_bytes=10))
     for text in ("x" * 6, "y" * 6, "z" * 100):

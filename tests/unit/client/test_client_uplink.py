@@ -30,7 +30,9 @@ class PlayedWay:
     def is_active(self, tag: str) -> bool:
         return self.active.get(tag, False)
 
-    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+    def post_data(
+        self, tag: str, frames: Sequence[Frame], key: str | None = None, queue_size: int | None = None
+    ) -> bool:
         message = json.loads(frames[0])
         data = message["data"]
         if message["type"] == "LT":
