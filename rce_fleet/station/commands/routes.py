@@ -289,8 +289,13 @@ async def _stop(sender: CommandSender, hold: ManualHold, guard: DriveGuard) -> N
     loop = asyncio.get_running_loop()
     while True:
         await asyncio.sleep(DEAD_S / 4)
-        if guard.check(loop.time()) or hold.why_not:
+        if guard.check(loop.time()) or _why_not(sender, hold):
             sender.send(velocity_message(0.0, 0.0))
+
+
+def _why_not(sender: CommandSender, hold: ManualHold) -> str:
+    """Return why the robot must stand, whatever the page asks for; empty: it may drive."""
+    return hold.why_not or ("" if sender.is_connected else "the robot is not connected")
 
 
 async def _check(may_drive: Callable[[], Awaitable[bool]]) -> None:
@@ -320,7 +325,7 @@ async def _pass_on(
                 sender.send(velocity_message(0.0, 0.0))
                 await _refuse(request, socket, f"not a frame: {error.errors()[0]['msg']}")
                 break
-            speed, turn_rate = guard.take(frame, loop.time(), hold.why_not)
+            speed, turn_rate = guard.take(frame, loop.time(), _why_not(sender, hold))
             sender.send(velocity_message(speed, turn_rate))
             answer = {"number": frame.number, "speed": speed, "turn_rate": turn_rate, "reason": guard.reason}
             await socket.send_str(json.dumps(answer))

@@ -1,5 +1,6 @@
 // Driving a robot by hand: keys, a gamepad or the stick on the screen, with a dead-man's switch and the latency shown.
 
+import { heartbeatAge, OFFLINE_S } from "./conditions.js";
 import { t } from "./texts.js";
 
 const FRAME_MS = 80;
@@ -89,10 +90,18 @@ export class Drive {
     for (const number of this.#sent.keys()) if (number <= answer.number) this.#sent.delete(number);
     this.#answered = performance.now();
     if (sent !== undefined) this.#roundTrip = (this.#answered - sent) / 1000;
-    this.latency.textContent = t("drive.latency", { ms: Math.round(1000 * this.#roundTrip) });
-    this.latency.className = this.#roundTrip > LATE_S / 2 ? "bad" : "quiet";
+    this.#showLatency();
     this.state.textContent = answer.reason || t("drive.drives", { speed: answer.speed.toFixed(2), turn: answer.turn_rate.toFixed(2) });
     this.state.className = answer.reason ? "warn" : "good";
+  }
+
+  // The way to the station is measured; of the robot only its last sign of life, which the planner heard, is known.
+  #showLatency() {
+    const robot = this.fleet.robots.get(this.robot);
+    const age = robot ? heartbeatAge(robot) : null;
+    const ms = Math.round(1000 * this.#roundTrip);
+    this.latency.textContent = age === null ? t("drive.latency.unheard", { ms }) : t("drive.latency", { ms, seconds: age.toFixed(1) });
+    this.latency.className = this.#roundTrip > LATE_S / 2 || age === null || age > OFFLINE_S ? "bad" : "quiet";
   }
 
   #send() {
@@ -106,8 +115,9 @@ export class Drive {
     if (late) this.state.textContent = t("drive.late");
   }
 
-  // [forward, left, whether the dead-man's switch is held]
+  // [forward, left, whether the dead-man's switch is held]. A gamepad's state is old while the page is not in focus.
   #wanted() {
+    if (document.hidden || !document.hasFocus()) return [0, 0, false];
     const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected);
     if (pad && (pad.buttons[4]?.pressed || pad.buttons[5]?.pressed)) {
       const axis = (value) => (Math.abs(value) < DEAD_ZONE ? 0 : value);

@@ -101,16 +101,50 @@ async def check_pose(made: Site, page: Page) -> None:
     assert abs(pose.orientation.z) == pytest.approx(1.0, abs=0.02), "left: half a turn"
 
 
+GAMEPAD = """() => {
+    rceFleet.gamepad = { connected: true, axes: [0, -1], buttons: Array(8).fill({ pressed: false }) };
+    navigator.getGamepads = () => [null, rceFleet.gamepad];
+}"""
+"""A gamepad whose stick is pushed forward."""
+
+
+async def check_gamepad(made: Site, page: Page) -> None:
+    """It drives while a shoulder button is pressed, but not a page that is hidden or not in focus.
+
+    A browser does not tell a gamepad's changes to such a page.
+    """
+    await page.evaluate(GAMEPAD)
+    made.velocities.clear()
+    await made.until(lambda: len(made.velocities) > 1)
+    assert set(made.velocities) == {(0.0, 0.0)}
+    await page.evaluate("void (rceFleet.gamepad.buttons[5] = { pressed: true })")
+    await made.until(lambda: made.velocities[-1] == pytest.approx((0.35, 0.0)))
+    for lost, back in (
+        ("document.hasFocus = () => false", "delete document.hasFocus"),
+        (
+            "Object.defineProperty(document, 'hidden', { value: true, configurable: true })",
+            "delete document.hidden",
+        ),
+    ):
+        await page.evaluate(f"void ({lost})")
+        await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+        await page.evaluate(f"void ({back})")
+        await made.until(lambda: made.velocities[-1] == pytest.approx((0.35, 0.0)))
+    await page.evaluate("void (navigator.getGamepads = () => [])")
+    await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+
+
 async def check_drive(made: Site, page: Page) -> None:
     """Keys drive while the switch is held, the stick by itself; the round trip is shown."""
     await page.locator("#robot-card button", has_text="Drive by hand").click()
-    await page.locator("#drive-latency", has_text="round trip").wait_for()
+    await page.locator("#drive-latency", has_text="round trip to the station").wait_for()
     await page.keyboard.down("ArrowUp")
     await page.keyboard.down("Space")
     await made.until(lambda: made.velocities and made.velocities[-1] == pytest.approx((0.35, 0.0)))
     await page.keyboard.up("Space")
     await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
     await page.keyboard.up("ArrowUp")
+    await check_gamepad(made, page)
     pad = await page.locator("#drive-pad").bounding_box()
     assert pad is not None
     x, y = pad["x"] + pad["width"] / 2, pad["y"] + pad["height"] / 2

@@ -20,7 +20,7 @@ from unit.station.test_station_view import robot, state
 from rce.aio.tasks import cancel_and_wait
 from rce.ros.core import Core
 from rce.ros.multimaster.discovery import Discovery
-from rce.ros.node import Node
+from rce.ros.node import Node, Subscriber
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
 from rce_fleet.station.authentication import Authenticator, StationUser, TokenAuthenticator
@@ -84,6 +84,8 @@ class Site:
     view: FleetView
     login: Login
     station: Station
+    motor: Subscriber | None = None
+    """The robot's subscription to velocities."""
     stops: deque[bool] = field(default_factory=deque)
     velocities: deque[tuple[float, float]] = field(default_factory=deque)
     poses: deque[Message] = field(default_factory=deque)
@@ -142,7 +144,7 @@ async def site(authenticator: Authenticator | None = None, robots: int = 2) -> A
             )
             for number in range(3, robots + 1):
                 await node.subscribe(f"/Robot{number}/emergency_stop", "std_msgs/Bool", lambda _said: None)
-            await node.subscribe(
+            made.motor = await node.subscribe(
                 "/Robot1/raw_cmd_vel",
                 "geometry_msgs/Twist",
                 lambda said: made.velocities.append((said.linear.x, said.angular.z)),
@@ -273,6 +275,21 @@ async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
                 assert "is driven by" in json.loads(await second.receive_str(timeout=LIMIT_S))["error"]
         await made.until(lambda: made.fleet.modes[-1] == ("Robot1", "automatic"))
         await made.until(lambda: made.control.driven == {})
+
+
+async def test_a_robot_that_is_away_is_not_shown_as_driven() -> None:
+    """The answers to frames say so, whatever they ask for."""
+    async with site() as made, made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+        assert (await _frame(page, 0))["speed"] == 0.2
+        assert made.motor is not None
+        await made.motor.close()
+        async with asyncio.timeout(LIMIT_S):
+            for number in range(1, 1_000_000):
+                answer = await _frame(page, number)
+                if answer["speed"] == 0.0:
+                    break
+                await asyncio.sleep(0.01)
+        assert answer["reason"] == "the robot is not connected"
 
 
 async def test_a_station_that_ends_gives_driven_robots_their_modes_back() -> None:
