@@ -66,6 +66,7 @@ class FleetRobotModel(ApiModel):
         description="Who drives it: automatic (the planner), paused, stopped (emergency), manual,"
         " out_of_service or dead."
     )
+    mode_reason: str = Field(default="", description="Why it has its mode, as who set it said.")
     reason: str
     cell: int | None
     goal: int | None

@@ -205,3 +205,11 @@ class HoldRequest(ApiModel):
     """Why a task is held, a robot is paused or taken out."""
 
     reason: str = Field(default="", description="For people.", max_length=500)
+
+
+class PutInRequest(HoldRequest):
+    """The mode of a robot that is put into service again, and why it has it."""
+
+    mode: Literal["automatic", "paused", "stopped"] = Field(
+        default="automatic", description="paused, stopped: it stands until it is resumed."
+    )

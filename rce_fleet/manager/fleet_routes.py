@@ -16,7 +16,7 @@ from rce_fleet.api.fleet import (
     RobotChange,
     RobotList,
 )
-from rce_fleet.api.tasks import HoldRequest
+from rce_fleet.api.tasks import HoldRequest, PutInRequest
 from rce_fleet.exceptions import PlannerSilentError, TaskRefusedError, UnknownTaskError
 from rce_fleet.journal.journal import EventQuery
 from rce_fleet.manager.convert import read_profile, show_profile
@@ -72,7 +72,8 @@ async def change_robot(call: Call) -> FleetAnswer:
 
 async def pause(call: Call) -> FleetAnswer:
     """Let a robot stand still; it keeps its task."""
-    return await _set_mode(call, "paused", "paused", unless_out=True)
+    reason = call.model(HoldRequest).reason
+    return await _set_mode(call, "paused", "paused", reason, unless_out=True)
 
 
 async def resume(call: Call) -> FleetAnswer:
@@ -82,12 +83,13 @@ async def resume(call: Call) -> FleetAnswer:
 
 async def take_out(call: Call) -> FleetAnswer:
     """Take a robot out of service: others get its tasks, but not its load."""
-    return await _set_mode(call, "out_of_service", "taken out")
+    return await _set_mode(call, "out_of_service", "taken out", call.model(HoldRequest).reason)
 
 
 async def put_in(call: Call) -> FleetAnswer:
-    """Put a robot into service again."""
-    return await _set_mode(call, AUTOMATIC, "put in")
+    """Put a robot into service again; one that shall stand never drives in between."""
+    model = call.model(PutInRequest)
+    return await _set_mode(call, model.mode, "put in", model.reason if model.mode != AUTOMATIC else "")
 
 
 async def set_fleet_mode(call: Call) -> FleetAnswer:
@@ -131,14 +133,15 @@ def _entry(call: Call) -> tuple[str, RobotEntry]:
     return name, entry
 
 
-async def _set_mode(call: Call, mode: str, what: str, *, unless_out: bool = False) -> FleetAnswer:
+async def _set_mode(
+    call: Call, mode: str, what: str, reason: str = "", *, unless_out: bool = False
+) -> FleetAnswer:
     """Set who drives a robot; if the planner refuses, its mode stays."""
     manager, user = call.manager, call.request.user
     async with manager.changes.hold("mode", _robot(call)):
         name, entry = _entry(call)
         if unless_out and entry.is_out:
             raise TaskRefusedError(f"{name} is out of service: put it in")
-        reason = call.model(HoldRequest).reason if mode != AUTOMATIC else ""
         if (entry.mode, entry.reason) == (mode, reason):
             await manager.commit()  # it may not be in the journal yet
             return _robot_answer(call, name)
@@ -188,6 +191,7 @@ def _show_robot(call: Call, name: str, queues: dict[str, list[str]]) -> FleetRob
         loads=[] if task is None else list(carried(task)),
         profile=show_profile(manager.dispatcher.profile(name)),
         mode=entry.mode,
+        mode_reason=entry.reason,
         revision=entry.revision,
     )
 

@@ -25,7 +25,15 @@ from rce_fleet.api.fleet import (
     ZoneModel,
     ZoneRequest,
 )
-from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskModel, TaskPage, TaskRequest
+from rce_fleet.api.tasks import (
+    HoldRequest,
+    LoadRequest,
+    PutInRequest,
+    TaskChange,
+    TaskModel,
+    TaskPage,
+    TaskRequest,
+)
 from rce_fleet.station.access import USER, problem
 from rce_fleet.station.planner_client import PlannerUnavailableError
 
@@ -291,7 +299,9 @@ ROUTES: list[Route[str]] = [
         reply=FleetRobotModel,
     ),
     _route(
-        "POST", "/robots/{robot}/put-in", "put_in_robot", "Put a robot into service", reply=FleetRobotModel
+        *("POST", "/robots/{robot}/put-in", "put_in_robot", "Put a robot into service"),
+        body=PutInRequest,
+        reply=FleetRobotModel,
     ),
     _route("GET", "/chargers", "", "Return chargers, parking places and return cells", reply=ChargersState),
     _route(

@@ -28,10 +28,32 @@ export class Actions {
     return this.operator.act(t(`action.${key}.done`, { robot: id }), run, undo);
   }
 
-  pause(id) { return this.#do("pause", id, () => ask("POST", at(id, "pause"), {}), () => ask("POST", at(id, "resume"))); }
-  resume(id) { return this.#do("resume", id, () => ask("POST", at(id, "resume")), () => ask("POST", at(id, "pause"), {})); }
-  takeOut(id) { return this.#do("takeOut", id, () => ask("POST", at(id, "take-out"), {}), () => ask("POST", at(id, "put-in"))); }
-  putIn(id) { return this.#do("putIn", id, () => ask("POST", at(id, "put-in")), () => ask("POST", at(id, "take-out"), {})); }
+  // What the robot's own mode is, and why; one that is driven by hand cannot be given back to its driver, and stands.
+  #own(id) {
+    const { ownMode, ownReason } = this.fleet.robots.get(id) ?? {};
+    const mode = ["automatic", "stopped"].includes(ownMode) ? ownMode : "paused";
+    return { mode, reason: mode === ownMode && ownReason ? ownReason : "", isManual: ownMode === "manual" };
+  }
+
+  pause(id) {
+    const undo = this.#own(id).isManual ? null : () => ask("POST", at(id, "resume"));
+    return this.#do("pause", id, () => ask("POST", at(id, "pause"), {}), undo);
+  }
+
+  resume(id) {
+    const { reason } = this.#own(id);
+    return this.#do("resume", id, () => ask("POST", at(id, "resume")), () => ask("POST", at(id, "pause"), { reason }));
+  }
+
+  takeOut(id) {
+    const { mode, reason } = this.#own(id);
+    return this.#do("takeOut", id, () => ask("POST", at(id, "take-out"), {}), () => ask("POST", at(id, "put-in"), { mode, reason }));
+  }
+
+  putIn(id) {
+    const reason = this.fleet.robots.get(id)?.ownReason ?? "";
+    return this.#do("putIn", id, () => ask("POST", at(id, "put-in")), () => ask("POST", at(id, "take-out"), { reason }));
+  }
 
   // Without a manager the robot's goal is removed.
   cancel(id) {

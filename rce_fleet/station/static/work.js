@@ -59,7 +59,7 @@ export class Work extends EventTarget {
     this.questions = [];
     this.atRisk = [];
     this.statistics = null;
-    for (const robot of this.fleet.robots.values()) Object.assign(robot, { task: null, activity: null, ownMode: null, queue: [], loads: 0, deadlineAtRisk: null });
+    for (const robot of this.fleet.robots.values()) Object.assign(robot, { task: null, activity: null, ownMode: null, ownReason: "", queue: [], loads: 0, deadlineAtRisk: null });
     this.dispatchEvent(new Event("change"));
   }
 
@@ -113,12 +113,12 @@ export class Work extends EventTarget {
   // What the manager knows of robots beside the planner: batteries, tasks, activities, and their own modes, which
   // stay as they are while the whole fleet is paused.
   #takeRobots(robots) {
-    for (const { id, battery, task, activity, mode, queue, loads } of robots) {
+    for (const { id, battery, task, activity, mode, mode_reason: ownReason, queue, loads } of robots) {
       const robot = this.fleet.robots.get(id);
       if (!robot) continue;
       const doing = this.find(task);
       const late = doing && isAtRisk(doing);
-      Object.assign(robot, { battery, task, activity, ownMode: mode, queue, loads: loads?.length ?? 0, deadlineAtRisk: late ? task : null });
+      Object.assign(robot, { battery, task, activity, ownMode: mode, ownReason, queue, loads: loads?.length ?? 0, deadlineAtRisk: late ? task : null });
     }
   }
 }

@@ -6,6 +6,7 @@ import json
 import time
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -274,6 +275,24 @@ async def test_a_paused_fleet_offers_no_resume_of_a_robot(tmp_path: Path) -> Non
         await page.locator("#robot-card button", has_text="Resume").click()
         await page.locator("#robot-card button", has_text="Pause").wait_for()
         assert client.manager.book.entry("Robot1").mode == "automatic"
+
+
+async def test_undo_lets_no_robot_drive_that_stood_before(tmp_path: Path) -> None:
+    """One that was taken out is paused again, and one that was resumed, too; the reason of before is kept."""
+    async with managed(tmp_path) as (_, client, page):
+        entry = partial(client.manager.book.entry, "Robot1")
+        client.manager.facts.robots["Robot1"] = RobotFacts("Robot1")
+        for action, mode in (("takeOut", "out_of_service"), ("resume", "automatic")):
+            await client.ask("POST", "/robots/Robot1/pause", {"reason": "visitors"})
+            await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').ownReason === 'visitors'")
+            await page.evaluate(f"void rceFleet.actions.{action}('Robot1')")
+            await page.wait_for_function(
+                "mode => rceFleet.fleet.robots.get('Robot1').ownMode === mode", arg=mode
+            )
+            revision = entry().revision
+            await page.locator("#undo:enabled").click()
+            await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').ownReason === 'visitors'")
+            assert (entry().mode, entry().reason, entry().revision) == ("paused", "visitors", revision + 1)
 
 
 async def test_undo_of_a_mode_sets_the_one_before() -> None:

@@ -241,6 +241,20 @@ async def test_a_robot_that_is_out_is_not_brought_back(client: ManagerClient, ch
     assert client.manager.book.entry("Robot1").mode == "out_of_service"
 
 
+@pytest.mark.parametrize("mode", ["paused", "stopped"])
+async def test_a_robot_that_is_put_in_may_stand(client: ManagerClient, mode: str) -> None:
+    """As before it was taken out: the planner is never told to drive it."""
+    client.manager.facts.is_current = True
+    client.manager.planner_began(PlannerRun("1", "8 x 8"))
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    await client.ask("POST", "/robots/Robot1/take-out", {"reason": "a wheel"})
+    put_in = {"mode": mode, "reason": "visitors"}
+    status, body, _ = await client.ask("POST", "/robots/Robot1/put-in", put_in)
+    assert (status, body["mode"], body["mode_reason"]) == (200, mode, "visitors")
+    assert [call[2] for call in client.planner.calls] == ["out_of_service", mode]
+    assert (await client.ask("POST", "/robots/Robot1/put-in", {"mode": "manual"}))[0] == 422
+
+
 async def test_a_mode_that_the_planner_refuses_stays(client: ManagerClient) -> None:
     client.manager.facts.is_current = True
     client.manager.planner_began(PlannerRun("1", "8 x 8"))
