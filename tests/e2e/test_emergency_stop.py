@@ -1,4 +1,4 @@
-"""An emergency stop reaches a robot through a real engine, without any planner."""
+"""Emergency stops, velocities and initial poses reach a robot through a real engine, without any planner."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import sys
 from collections import deque
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from rce.ros.types import TypeRegistry
 from rce_client.connection import Connection
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
-from rce_fleet.station.commands.sources import EngineCommandSource
+from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
+from rce_fleet.station.commands.sources import CommandError, EngineCommandSource
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.fleet_link import FleetLink
@@ -44,6 +45,8 @@ class Site:
     folder: Path
     bridge: Program
     got: deque[bool]
+    told: deque[tuple[float, float]]
+    """What the robot was told: of velocities speed and turn rate, of poses x and y."""
     watch: EngineWatch
 
 
@@ -56,6 +59,17 @@ async def robot_at_engine() -> AsyncIterator[Site]:
     ):
         got: deque[bool] = deque()
         await node.subscribe("emergency_stop", "std_msgs/Bool", lambda message: got.append(message.data))
+        told: deque[tuple[float, float]] = deque()
+        await node.subscribe(
+            "raw_cmd_vel",
+            "geometry_msgs/Twist",
+            lambda message: told.append((message.linear.x, message.angular.z)),
+        )
+        await node.subscribe(
+            "initialpose",
+            "geometry_msgs/PoseWithCovarianceStamped",
+            lambda message: told.append((message.pose.pose.position.x, message.pose.pose.position.y)),
+        )
         whole = robot_config(1, FleetAccount(url=engine.url))
         kept: dict[str, Any] = {key: whole[key] for key in ("url", "userID", "password", "robotID")}
         kept["interfaces"] = [item for item in whole["interfaces"] if item["iTag"].startswith("command_")]
@@ -68,7 +82,7 @@ async def robot_at_engine() -> AsyncIterator[Site]:
         watching = asyncio.create_task(watch.run())
         await bridge.start()
         try:
-            yield Site(engine.url, engine.folder, bridge, got, watch)
+            yield Site(engine.url, engine.folder, bridge, got, told, watch)
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
@@ -105,6 +119,38 @@ async def test_an_emergency_stop_needs_no_planner() -> None:
             await asyncio.gather(keeping, return_exceptions=True)
             await control.close()
             await connection.remove_all()
+
+
+async def test_a_robot_is_driven_and_localized_by_the_engine() -> None:
+    """Once its bridge has ended, the station knows that it does not get velocities any more."""
+    async with (
+        robot_at_engine() as site,
+        Connection(site.url, "testUser", "testUser", "fleetOperator") as connection,
+    ):
+        source = EngineCommandSource(lambda: connection, site.watch.read_items)
+        control = RobotControl(source, lambda: ["Robot1"])
+
+        async def localized() -> bool:
+            with suppress(CommandError):
+                await control.set_pose("Robot1", 1.5, 2.5, 0.0)
+            return (1.5, 2.5) in site.told
+
+        await until(localized, what="the robot is told where it is")
+        sender = await control.open("Robot1", VELOCITY)
+
+        async def drives() -> bool:
+            sender.send(velocity_message(0.25, -0.5))
+            return (0.25, -0.5) in site.told
+
+        async def is_away() -> bool:
+            return not sender.is_connected
+
+        await until(drives, what="the robot is driven")
+        assert sender.is_connected
+        await site.bridge.stop()
+        await until(is_away, what="the station knows that the robot is away")
+        await sender.close()
+        await connection.remove_all()
 
 
 async def nothing() -> None: ...
