@@ -88,7 +88,13 @@ export class Actions {
       before ??= (await ask("GET", `/tasks/${task}`)).priority;
       return ask("PATCH", `/tasks/${task}`, { priority });
     };
-    return this.operator.act(t("action.priority.done", { task, priority }), run, () => ask("PATCH", `/tasks/${task}`, { priority: before }));
+    // A task's revision also grows when robots get on with it, so undo compares what the operator changed.
+    const undo = async () => {
+      const now = await ask("GET", `/tasks/${task}`);
+      if (now.priority !== priority) throw new Error(t("action.priority.other", { task, priority: now.priority }));
+      return ask("PATCH", `/tasks/${task}`, { priority: before }, ifMatch(now.revision));
+    };
+    return this.operator.act(t("action.priority.done", { task, priority }), run, undo);
   }
 
   // Give a robot's task to another one; the manager refuses it once the robot has the load.

@@ -26,6 +26,7 @@ const TEXTS = {
   "action.pause": "Pause",
   "action.pause.done": "{robot} is paused",
   "action.priority.done": "task {task} has priority {priority}",
+  "action.priority.other": "task {task} has priority {priority} now: another user changed it",
   "action.putIn": "Put in",
   "action.putIn.done": "{robot} is in service",
   "action.raise": "Prefer",

@@ -295,6 +295,27 @@ async def test_undo_lets_no_robot_drive_that_stood_before(tmp_path: Path) -> Non
             assert (entry().mode, entry().reason, entry().revision) == ("paused", "visitors", revision + 1)
 
 
+async def test_undo_keeps_a_priority_that_another_user_set(tmp_path: Path) -> None:
+    """It is refused then, and sets the priority of before once it is the operator's again."""
+    async with managed(tmp_path) as (_, client, page):
+        task = (await client.ask("POST", "/tasks", DELIVERY))[1]["id"]
+        path = f"/tasks/{task}"
+        before = client.manager.book.find(task).order.priority
+        await page.evaluate("id => void rceFleet.actions.raise(id, 90)", task)
+        await page.locator("#undo:enabled").wait_for()
+        await page.locator("#message", has_text="has priority 90").wait_for()
+        await client.ask("PATCH", path, {"priority": 70})
+        await page.locator("#undo:enabled").click()
+        await page.locator("#message.bad", has_text="another user changed it").wait_for()
+        assert client.manager.book.find(task).order.priority == 70
+        await client.ask("PATCH", path, {"priority": 90})
+        await page.locator("#undo:enabled").click()
+        await page.locator("#undo:disabled").wait_for()
+        await page.wait_for_function(
+            "([id, old]) => rceFleet.work.find(id).priority === old", arg=[task, before]
+        )
+
+
 async def test_undo_of_a_mode_sets_the_one_before() -> None:
     """What stopped the fleet cannot be asked for by the page: it asks before the fleet drives again."""
     async with site() as made:
