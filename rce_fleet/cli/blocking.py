@@ -6,7 +6,6 @@ after its place, so that ``free`` finds it: ``block 12``, ``block 12>13 for Robo
 
 from __future__ import annotations
 
-import contextlib
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,10 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rce.printable import for_terminal
 from rce_fleet.api.fleet import ZoneRequest
 from rce_fleet.cli.access import STATION, Station, checked, do
 from rce_fleet.cli.times import read_time
-from rce_fleet.exceptions import StationError
+from rce_fleet.client import FleetApiUnavailableError
+from rce_master.cli.exceptions import CliError
 
 if TYPE_CHECKING:
     from rce_fleet.api.fleet import LaneModel
@@ -45,6 +46,11 @@ class _Place:
         """Return the name of its zone for these robots."""
         return f"block {self.name}" + (f" for {' '.join(robots)}" if robots else "")
 
+    def has_zone(self, zone: str, robots: list[str]) -> bool:
+        """Return whether it has this zone for these robots; without robots, for all or any."""
+        is_for_some = zone.startswith(f"{self.zone([])} for ")
+        return zone == self.zone(robots) or (is_for_some and not robots)
+
 
 def block(
     places: Places = None,
@@ -66,20 +72,20 @@ def block(
     async def work(client: FleetClient) -> None:
         for place in [*found, *await _lanes(client, lane)]:
             if place.cells and not (robots or reason or end):
-                await client.set_blocked(place.cells[0], blocked=True)
-            else:
-                with checked():
-                    asked = ZoneRequest.model_validate(
-                        {
-                            "kind": "blocked",
-                            "cells": place.cells,
-                            "edges": place.edges,
-                            "robots": robots,
-                            "reason": reason,
-                            "until": end,
-                        }
-                    )
-                await client.set_zone(place.zone(robots), asked)
+                typer.echo(for_terminal(await client.set_blocked(place.cells[0], blocked=True)))
+                continue
+            with checked():
+                asked = ZoneRequest.model_validate(
+                    {
+                        "kind": "blocked",
+                        "cells": place.cells,
+                        "edges": place.edges,
+                        "robots": robots,
+                        "reason": reason,
+                        "until": end,
+                    }
+                )
+            await client.set_zone(place.zone(robots), asked)
             whom = f" for {', '.join(robots)}" if robots else ""
             when = f" until {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(end))}" if end else ""
             typer.echo(f"{_word(place)} is blocked{whom}{when}")
@@ -98,19 +104,42 @@ def free(
     found += [_Place(f"lane {name}") for name in lane or ()]
 
     async def work(client: FleetClient) -> None:
-        zones: list[str] = []
-        with contextlib.suppress(StationError):  # without a fleet manager there are cells only
-            zones = [zone.id for zone in await client.zones()]
+        zones = await _zones(client, cells_only=not robots and all(place.cells for place in found))
+        missing = []
         for place in found:
-            for zone in zones:
-                is_for_some = zone.startswith(f"{place.zone([])} for ")
-                if zone == place.zone(robots) or (is_for_some and not robots):
-                    await client.remove_zone(zone)
+            wanted = [zone for zone in zones if place.has_zone(zone, robots)]
+            for zone in wanted:
+                await client.remove_zone(zone)
             if place.cells and not robots:
-                await client.set_blocked(place.cells[0], blocked=False)
-            typer.echo(f"{_word(place)} is free" + (f" for {', '.join(robots)}" if robots else ""))
+                typer.echo(for_terminal(await client.set_blocked(place.cells[0], blocked=False)))
+                continue
+            whom = f" for {', '.join(robots)}" if robots else ""
+            if wanted:
+                typer.echo(f"{_word(place)} is free{whom}")
+            else:
+                missing.append(f"{_word(place)}{whom}")
+        if missing:
+            raise CliError(
+                f"not blocked by rce fleet block: {', '.join(missing)}; rce fleet zone list shows all zones"
+            )
 
     do(station, work)
+
+
+async def _zones(client: FleetClient, *, cells_only: bool) -> list[str]:
+    """Return the names of the zones; none, with a warning, for plain cells without a fleet manager.
+
+    Raises:
+        StationError: They cannot be read.
+    """
+    try:
+        return [zone.id for zone in await client.zones()]
+    except FleetApiUnavailableError as error:
+        if not cells_only:
+            raise
+        reason = for_terminal(str(error))
+        typer.echo(f"rce fleet: zones are left as they are, they cannot be read: {reason}", err=True)
+        return []
 
 
 def _places(texts: list[str] | None, lanes: list[str] | None) -> list[_Place]:

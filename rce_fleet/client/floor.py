@@ -11,7 +11,7 @@ from rce_fleet.api.fleet import (
     ZoneRequest,
 )
 from rce_fleet.client.requests import ApiRequests, if_match, path_part
-from rce_fleet.station.api import CellRequest, FleetModel
+from rce_fleet.station.api import Answer, CellRequest, FleetModel
 
 
 class FloorRequests(ApiRequests):
@@ -27,17 +27,15 @@ class FloorRequests(ApiRequests):
         """
         return await self._read("/fleet", FleetModel)
 
-    async def set_blocked(self, cell: int, *, blocked: bool) -> None:
-        """Block or free a cell.
+    async def set_blocked(self, cell: int, *, blocked: bool) -> str:
+        """Block or free a cell; return the answer for people.
 
         Example:
             ```python
-            await fleet.set_blocked(17, blocked=True)
+            print(await fleet.set_blocked(17, blocked=True))
             ```
         """
-        await self._transport.request(
-            "PUT", f"/cells/{cell}", body=CellRequest(blocked=blocked).model_dump_json()
-        )
+        return (await self._send("PUT", f"/cells/{cell}", Answer, CellRequest(blocked=blocked))).message
 
     async def map(self) -> FleetMapModel:
         """Return the grid.

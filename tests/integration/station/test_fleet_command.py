@@ -26,6 +26,7 @@ from rce_fleet.api.fleet import (
 from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
 from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
 from rce_fleet.cli.commands import app as commands
+from rce_fleet.station.api import Answer
 from rce_master.cli.credentials import FILE_VARIABLE
 
 TOKEN = "of-the-login"
@@ -95,6 +96,7 @@ class Station:
         self.bodies: list[Any] = []
         self.changes: list[str] = []
         self.zones: list[str] = []
+        self.has_manager = True
         self.wants = ""
         """The token that it asks for; empty: none."""
 
@@ -105,6 +107,8 @@ class Station:
         if request.can_read_body:
             self.bodies.append(await request.json())
         path = request.path.removeprefix("/api/v1/")
+        if path == "zones" and not self.has_manager:
+            return web.json_response({"error": "the fleet manager did not answer"}, status=503)
         if request.method != "GET":
             self.changes.append(f"{request.method} {path}")
         shown = self.shown(path, request.method).model_dump_json()
@@ -116,6 +120,9 @@ class Station:
             return ROBOT
         if path.startswith("zones/"):
             return ZONE
+        if path.startswith("cells/"):
+            word = "blocked" if self.bodies[-1]["blocked"] else "free"
+            return Answer(message=f"cell {path.removeprefix('cells/')} is {word}")
         zones = [ZONE.model_copy(update={"id": name}) for name in self.zones]
         found = {
             "robots": RobotList(robots=[ROBOT]),
@@ -371,6 +378,42 @@ async def test_what_was_blocked_is_freed(station: Station, url: str) -> None:
         "DELETE zones/block 4>5",
         "DELETE zones/block lane bay",
     ]
+
+
+@pytest.mark.parametrize("words", [("4>5",), ("--lane", "bay"), ("4", "--robot", "R1"), ("4", "4>5")])
+async def test_nothing_is_freed_without_a_manager(station: Station, url: str, words: tuple[str, ...]) -> None:
+    """Moves, lanes and cells for some robots are zones: nothing was done, but "is free" was printed."""
+    station.has_manager = False
+    code, told = await run(url, "free", *words)
+    assert (code, told, station.changes) == (1, "rce fleet: the fleet manager did not answer\n", [])
+
+
+async def test_cells_are_freed_without_a_manager(station: Station, url: str) -> None:
+    """A fleet may have none. What it says of its zones goes to the errors."""
+    station.has_manager = False
+    code, told = await run(url, "free", "4")
+    assert (code, station.changes) == (0, ["PUT cells/4"])
+    assert told.splitlines() == [
+        "rce fleet: zones are left as they are, they cannot be read: the fleet manager did not answer",
+        "cell 4 is free",
+    ]
+
+
+async def test_free_of_what_was_not_blocked_fails(station: Station, url: str) -> None:
+    station.zones = ["block 4>5"]
+    code, told = await run(url, "free", "4>5", "5>4", "4", "--robot", "R1")
+    assert (code, station.changes) == (1, [])
+    assert "not blocked by rce fleet block: the move 4>5 for R1, the move 5>4 for R1, cell 4 for R1" in told
+    code, told = await run(url, "free", "5>4", "4>5")
+    assert (code, station.changes) == (1, ["DELETE zones/block 4>5"])
+    assert told.splitlines()[0] == "the move 4>5 is free"
+    assert "not blocked by rce fleet block: the move 5>4;" in told
+
+
+async def test_free_without_a_login_says_so(station: Station, url: str) -> None:
+    station.wants = TOKEN
+    code, told = await run(url, "free", "4")
+    assert (code, "log in" in told, station.changes) == (1, True, [])
 
 
 @pytest.mark.parametrize(
