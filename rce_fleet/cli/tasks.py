@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ from rce.printable import one_line
 from rce_fleet.api.tasks import LoadRequest, RepeatModel, StopModel, TaskChange, TaskModel, TaskRequest
 from rce_fleet.cli.access import STATION, AsJson, Station, checked, do, echo_json, echo_table
 from rce_fleet.cli.times import read_moment
+from rce_fleet.client import FleetApiUnavailableError
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
@@ -122,8 +124,14 @@ def add(
             repeat=None if every is None else RepeatModel(every=every, count=count),
         )
 
+    used = key or secrets.token_hex(16)
+
     async def work(client: FleetClient) -> None:
-        typer.echo((await client.create_task(task, key=key)).id)
+        try:
+            typer.echo((await client.create_task(task, key=used)).id)
+        except FleetApiUnavailableError as error:
+            again = f"to repeat the command without a second task, add --key {used}"
+            raise FleetApiUnavailableError(f"{error}; {again}") from error
 
     do(station, work)
 

@@ -9,12 +9,17 @@ const ORDER = ["stops", "name", "rounds", "priority", "deadline", "when_late", "
 
 const REFUSED = [404, 409, 422]; // of one cell: others can be tried
 
+// After these, or without any answer, a request may have been carried out.
+const UNANSWERED = [undefined, 502, 503, 504];
+const AGAIN_MS = [1000, 2000, 4000, 8000, 15000, 30000];
+
 const at = (robot, what) => `/robots/${encodeURIComponent(robot)}/${what}`;
 
 // What a change of a zone is for: this revision of it, and not one that another user made meanwhile; 0: there is none yet.
 const ifMatch = (revision) => ({ "If-Match": `"${revision}"` });
 
 export class Actions {
+  #keys = new Map(); // orders of tasks that were given up without an answer -> their keys
   #restored = new Map(); // "zone revision" -> the revision at which undo made the zone so again
 
   constructor(fleet, operator, work) {
@@ -76,7 +81,7 @@ export class Actions {
     const canUndo = !hasBegun && !isAwaited && task.requester === this.user;
     if (!canUndo && !(await isCertain("cancelTask", { task: id }))) return null;
     const order = Object.fromEntries(ORDER.map((name) => [name, task[name]]));
-    const undo = async () => ({ message: t("action.task.made", { task: (await ask("POST", "/tasks", order)).id }) });
+    const undo = async () => ({ message: t("action.task.made", { task: (await this.#createOnce(order)).id }) });
     return this.operator.act(t("action.cancelTask.done", { task: id }), () => ask("DELETE", `/tasks/${id}`), canUndo ? undo : null);
   }
 
@@ -120,12 +125,33 @@ export class Actions {
     await this.operator.act(
       t("action.task.done"),
       async () => {
-        made = await ask("POST", "/tasks", { stops, key: crypto.randomUUID?.() ?? String(Math.random()), ...fields });
+        made = await this.#createOnce({ stops, ...fields });
         return { message: t("action.task.made", { task: made.id }) };
       },
       () => ask("DELETE", `/tasks/${made.id}`),
     );
     return made;
+  }
+
+  // A request without an answer is sent again with its key, which makes one task only, also if the operator tries it again later.
+  async #createOnce(order) {
+    const content = JSON.stringify(order);
+    const key = this.#keys.get(content) ?? crypto.randomUUID?.() ?? String(Math.random());
+    this.#keys.delete(content);
+    for (const pause of [...AGAIN_MS, null]) {
+      try {
+        return await ask("POST", "/tasks", { ...order, key });
+      } catch (error) {
+        if (!UNANSWERED.includes(error.status)) throw error;
+        if (pause === null) {
+          this.#keys.set(content, key);
+          throw error;
+        }
+      }
+      this.operator.say(t("action.task.again"), true);
+      await new Promise((resolve) => setTimeout(resolve, pause));
+    }
+    return null;
   }
 
   sendTo(id, cell, before = this.fleet.robots.get(id)?.goal ?? null) {

@@ -40,6 +40,7 @@ const TEXTS = {
   "action.stop": "Stop",
   "action.takeOut": "Take out",
   "action.takeOut.done": "{robot} is out of service",
+  "action.task.again": "the fleet manager did not answer; the new task is sent again, and created once",
   "action.task.done": "the new task",
   "action.task.made": "task {task} is created",
   "action.zone.done": "zone {zone}",

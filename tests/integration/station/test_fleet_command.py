@@ -97,6 +97,8 @@ class Station:
         self.changes: list[str] = []
         self.zones: list[str] = []
         self.has_manager = True
+        self.lost = 0
+        """How many answers to changes are lost."""
         self.wants = ""
         """The token that it asks for; empty: none."""
 
@@ -111,6 +113,9 @@ class Station:
             return web.json_response({"error": "the fleet manager did not answer"}, status=503)
         if request.method != "GET":
             self.changes.append(f"{request.method} {path}")
+            if self.lost:
+                self.lost -= 1
+                return web.json_response({"error": "the fleet manager did not answer"}, status=503)
         shown = self.shown(path, request.method).model_dump_json()
         return web.Response(text=shown, content_type="application/json")
 
@@ -270,6 +275,17 @@ async def test_rce_fleet_repeats_a_task_with_its_dates(station: Station, url: st
     code, told = await run(url, "task", "add", "--cell", "5", "--deadline", "soon")
     told = " ".join(told.replace("│", " ").split())
     assert (code, "expected seconds from now, or a time such as 18:30" in told) == (2, True), told
+
+
+async def test_rce_fleet_tells_the_key_without_an_answer(station: Station, url: str) -> None:
+    """The task may have been created: only with its key does a second command not make another one."""
+    station.lost = 3  # as often as the command asks
+    code, told = await run(url, "task", "add", "--cell", "5")
+    assert (code, len(station.bodies), station.lost) == (1, 3, 0)
+    key = station.bodies[0]["key"]
+    assert told.endswith(f"to repeat the command without a second task, add --key {key}\n")
+    assert await run(url, "task", "add", "--cell", "5", "--key", key) == (0, "T7\n")
+    assert station.bodies == [station.bodies[0]] * 4
 
 
 async def test_rce_fleet_makes_lists_and_removes_zones(station: Station, url: str) -> None:

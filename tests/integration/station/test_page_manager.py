@@ -68,6 +68,25 @@ async def check_task(page: Page) -> None:
     assert "done" in row
 
 
+async def check_lost_answer(page: Page, fleet: ManagedFleet) -> None:
+    """The answer of the manager is lost: the task is created once, and undo cancels it."""
+    before = (await fleet.ask("GET", "/tasks")).body["tasks"]
+    await page.evaluate("""() => {
+        const [send, sent] = [window.fetch, new Set()];
+        window.fetch = async (path, asked) => {
+            const answer = await send(path, asked);
+            if (asked.method !== "POST" || !path.endsWith("/tasks") || sent.has(asked.body)) return answer;
+            sent.add(asked.body);
+            throw new TypeError("Failed to fetch");
+        };
+    }""")
+    made = await page.evaluate("rceFleet.actions.createTask([{ cell: 18 }], { earliest_start: 4e9 })")
+    after = (await fleet.ask("GET", "/tasks")).body["tasks"]
+    assert [task["id"] for task in after[len(before) :]] == [made["id"]]
+    await page.locator("#undo").click()
+    await fleet.until_state(made["id"], "cancelled")
+
+
 async def press(page: Page, selector: str) -> None:
     """Click; the list is drawn again between press and release, as when a task changes then."""
     button = page.locator(selector)
@@ -153,6 +172,7 @@ async def test_an_operator_works_with_the_manager(tmp_path: Path) -> None:
             await asyncio.sleep(0.1)
         async with fleet_station(fleet.core.uri) as url, opened(url) as page:
             await check_task(page)
+            await check_lost_answer(page, fleet)
             await check_buttons(page, fleet)
             await check_robot(page)
             await check_zone(page, fleet)
