@@ -36,6 +36,8 @@ _DIGITS = 18
 _ID = re.compile(r"(?:([0-9a-f]{1,32}):)?([0-9]{1,18})")
 """The id of a server-sent event: the journal and the number; a number alone is of any journal."""
 COLUMNS = ("number", "time", "kind", "id", "name", "state", "robot", "user", "text", "revision")
+_CUT = "the fleet manager stopped in the middle of the history"
+"""Why an answer ends without its last chunk: what was sent must not be taken for all."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Beginnings of a text that spreadsheets take for a formula."""
 
@@ -88,15 +90,15 @@ class EventStreams:
         response = web.StreamResponse(headers=headers)
         await response.prepare(request)
         try:
-            # A client that loses the stream before the first event resumes it here, too.
-            begin = "" if cursor.number is None else f"id: {_id_of(cursor, cursor.number)}\n"
-            await write(request, response, f"retry: 2000\n{begin}\n".encode())
+            await write(request, response, f"retry: 2000\n{_place_of(cursor)}\n".encode())
             while True:
                 frames = await _next_frames(cursor)
                 if not await self._access.is_still_allowed(request):
                     await write(request, response, b": your login has ended; log in again\n\n")
                     return response
-                await write(request, response, "".join(frames or [": no event\n\n"]).encode())
+                await write(
+                    request, response, "".join(frames or [f"{_place_of(cursor)}: no event\n\n"]).encode()
+                )
         except ConnectionError:
             return response
 
@@ -118,10 +120,15 @@ class EventStreams:
         for _ in range(MAX_ROWS // _PAGE):
             asked = url.update_query({"after": str(after), "limit": str(_PAGE)})
             path = f"/history?{asked.raw_query_string}"
-            answer = await self._requests.ask("GET", path, user=request[USER])
+            try:
+                answer = await self._requests.ask("GET", path, user=request[USER])
+            except PlannerUnavailableError as error:
+                if response is None:
+                    raise
+                raise ConnectionError(f"{_CUT}: {error}") from error
             if answer["status"] != 200:  # noqa: PLR2004
                 if response is not None:
-                    raise ConnectionError("the manager stopped in the middle of the history")
+                    raise ConnectionError(f"{_CUT}: {answer['body']}")
                 return web.Response(
                     status=int(answer["status"]), text=answer["body"], content_type="application/json"
                 )
@@ -156,6 +163,11 @@ async def _next_frames(cursor: EventCursor) -> list[str]:
         )
         return [f"event: gap\nid: {_id_of(cursor, error.last)}\ndata: {told}\n\n"]
     return [f"id: {_id_of(cursor, one['number'])}\ndata: {json.dumps(one)}\n\n" for one in found]
+
+
+def _place_of(cursor: EventCursor) -> str:
+    """Return the line with the id from which a client resumes; empty: not known yet."""
+    return "" if cursor.number is None else f"id: {_id_of(cursor, cursor.number)}\n"
 
 
 def _id_of(cursor: EventCursor, number: int) -> str:

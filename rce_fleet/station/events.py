@@ -144,10 +144,10 @@ class EventFeed:
             return [self._kept[index] for index in range(first, min(first + PAGE, len(self._kept)))]
         return (await self._read(number, PAGE)).events
 
-    async def wait(self, number: int | None) -> bool:
-        """Wait for an event after a number, or the first one; return False if none came for a while."""
+    async def wait(self, number: int) -> bool:
+        """Wait for an event after a number; return False if none came for a while."""
         changed = self._changed
-        if self.newest is not None and (number is None or self.newest > number):
+        if self.newest is not None and self.newest > number:
             return True
         try:
             async with asyncio.timeout(RECHECK_S):
@@ -181,17 +181,20 @@ class EventCursor:
     async def next(self) -> Sequence[FleetEvent]:
         """Wait for events; none came if it returns none.
 
+        A client that wants events from now on gets none the first time, once the newest number is known.
+
         Raises:
             PlannerUnavailableError: The manager does not answer.
             EventsForgottenError: The next events are not kept any more; the next call begins after them.
             EventsRestartedError: The numbers began anew; the next call begins with the first event.
         """
         feed = self._feed
-        await self._check()
+        if self.number is None and feed.newest is not None:
+            self.number = feed.oldest - 1  # all of them came after this client
+        newest = await self._check()
         if self.number is None:
-            if not await feed.wait(None) or feed.newest is None:
-                return ()
-            self.number = feed.oldest - 1  # several may have come together
+            self.number = newest
+            return ()
         found = await self._after(self.number)
         if not found:
             found = await self._after(self.number, ask=not await feed.wait(self.number))
@@ -212,16 +215,17 @@ class EventCursor:
         self._compare()
         return found
 
-    async def _check(self) -> None:
-        """Notice a client that has events of a journal that is gone."""
+    async def _check(self) -> int | None:
+        """Notice a client that has events of a journal that is gone; return the newest number."""
         feed, number = self._feed, self.number
         if feed.journal:
             self._compare()
         newest = feed.newest
-        if not feed.journal or (number is not None and number > (newest or 0)):
+        if not feed.journal or (number or 0) > (newest or 0) or (number is None and newest is None):
             newest = await feed.locate()
         self._compare(is_ahead=number is not None and newest is not None and number > newest)
         self.journal = feed.journal
+        return newest
 
     def _compare(self, *, is_ahead: bool = False) -> None:
         feed = self._feed

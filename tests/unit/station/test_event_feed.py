@@ -15,6 +15,8 @@ from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station import events as module
 from rce_fleet.station.event_streams import COLUMNS, EventStreams, csv_rows
 from rce_fleet.station.events import EventBatch, EventCursor, EventFeed
+from rce_fleet.station.planner_client import PlannerUnavailableError
+from rce_fleet.station.server import _problems
 
 
 class Journal:
@@ -78,12 +80,43 @@ async def test_a_new_client_gets_events_from_now_on() -> None:
 
 async def test_a_new_client_gets_all_of_the_first_burst() -> None:
     """Several come together, before the client has its turn."""
-    journal = Journal(5)
+    journal = Journal(2)
     feed = EventFeed(journal.ask)
-    waiting = asyncio.create_task(EventCursor(feed, None).next())
+    cursor = EventCursor(feed, None)
+    assert (numbers(await cursor.next()), cursor.number) == ([], 2)
+    waiting = asyncio.create_task(cursor.next())
     await asyncio.sleep(0)
+    journal.grow(3)
     tell(feed, journal, 3, 4, 5)
     assert numbers(await waiting) == [3, 4, 5]
+
+
+async def test_a_first_event_whose_message_is_lost_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "RECHECK_S", 0.01)
+    journal = Journal(2)
+    cursor = EventCursor(EventFeed(journal.ask), None)
+    assert numbers(await cursor.next()) == []
+    journal.grow(1)
+    assert numbers(await cursor.next()) == [3]
+
+
+async def test_a_stream_of_a_quiet_fleet_resumes_where_it_broke() -> None:
+    """The station has seen no event yet: an event between two connections was lost without a word."""
+    journal = Journal(5)
+    app = web.Application(middlewares=[name_user])
+    streams = EventStreams(cast("Any", None), EventFeed(journal.ask), cast("Any", OpenAccess()))
+    app.router.add_get("/events", streams.events)
+    async with TestServer(app) as server, ClientSession() as session, asyncio.timeout(60):
+
+        async def follow(last: dict[str, str]) -> str:
+            headers = {"Accept": "text/event-stream", **last}
+            async with session.get(server.make_url("/events"), headers=headers) as reply:
+                await reply.content.readuntil(b"\n\n")
+                return (await reply.content.readuntil(b"\n\n")).decode()
+
+        assert (await follow({})).startswith("id: aa:5\n")
+        journal.grow(1)
+        assert (await follow({"Last-Event-ID": "aa:5"})).startswith("id: aa:6\ndata: ")
 
 
 async def test_a_stream_begins_with_the_id_of_the_newest_event() -> None:
@@ -170,6 +203,37 @@ def test_csv_has_times_and_no_formulas() -> None:
     assert row.startswith("3,1970-01-01T00:00:00.250+00:00,")
     assert "'@erp" in row
     assert '"\'=SUM(A1), ""x"""' in row
+
+
+class LeavingManager:
+    """Returns one full page of the history."""
+
+    def __init__(self) -> None:
+        self.pages = 1
+
+    async def ask(self, *_asked: object, **_options: object) -> dict[str, Any]:
+        if not self.pages:
+            raise PlannerUnavailableError("the fleet manager did not answer")
+        self.pages -= 1
+        event = dict.fromkeys(COLUMNS, "") | {"number": 1, "time": 0.0}
+        return {"status": 200, "body": json.dumps({"events": [event] * 1000, "next": 1000})}
+
+
+async def test_a_history_whose_manager_leaves_is_cut_off() -> None:
+    """A second answer inside the first one looked like a line of the file."""
+    streams = EventStreams(cast("Any", LeavingManager()), EventFeed(Journal().ask), cast("Any", OpenAccess()))
+    app = web.Application(middlewares=[_problems, name_user])
+    app.router.add_get("/history", streams.history)
+    async with TestServer(app) as server, asyncio.timeout(60):
+        reader, writer = await asyncio.open_connection(server.host, server.port)
+        writer.write(b"GET /history?format=csv HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n")
+        try:
+            answer = await reader.read()
+        finally:
+            writer.close()
+    assert answer.count(b"HTTP/1.1") == 1
+    assert answer.count(b"1970-01-01") == 1000
+    assert not answer.endswith(b"\r\n0\r\n\r\n"), "it looks whole"
 
 
 class ShortJournal(Journal):
