@@ -344,7 +344,7 @@ async def serve(
     )
     owed_modes = OwedModes(modes)
     manual_modes = ManualModes(fleet, view, owed_modes)
-    recorder = Recorder(view, open_records(history))
+    recorder = Recorder(view, open_records(history), feed.on_event)
     station = Station(
         view,
         fleet,

@@ -56,7 +56,8 @@ class FigureRecorder:
         self._ask = ask
 
     async def run(self) -> None:
-        """Sample until cancelled. A full disk ends it, not the station."""
+        """Sample until cancelled. On a full disk, it begins anew once there is room."""
+        fails = False
         while True:
             await asyncio.sleep(SAMPLE_EVERY_S)
             figures = await self.sample()
@@ -65,8 +66,11 @@ class FigureRecorder:
             try:
                 await asyncio.to_thread(self._records.add_figures, time.time(), figures)
             except sqlite3.Error as error:
-                _log.warning("figures are not recorded any more: %s", error)
-                return
+                if not fails:
+                    _log.warning("figures are not recorded now: %s", error)
+                fails = True
+            else:
+                fails = False
 
     async def sample(self) -> Figures:
         """Return the figures of this moment; empty before the first state of the fleet."""

@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,11 @@ FIGURES_LAST_S = 86400.0
 """Figures that are older are removed, seconds."""
 MOST_FRAMES = 120
 """Most records in one answer."""
+_REMOVE_LATER = "DELETE FROM records WHERE time >= ? RETURNING LENGTH(data)"
+_REMOVE_OLDEST = (
+    "DELETE FROM records WHERE time IN (SELECT time FROM records ORDER BY time LIMIT 50)"
+    " RETURNING LENGTH(data)"
+)
 
 Frame = dict[str, Any]
 
@@ -73,27 +78,41 @@ class Records:
     def add(self, now: float, frame: Frame, *, whole: bool) -> None:
         """Write a record, and remove the oldest ones that do not fit.
 
+        A whole one removes those of later times: the clock was set back, and a replay would mix both.
+
         Args:
             now: Seconds since 1970.
             frame: What changed.
             whole: Whether it is the complete state.
+
+        Raises:
+            sqlite3.Error: It cannot be written.
         """
         data = zlib.compress(json.dumps(frame, separators=(",", ":")).encode(), 6)
-        with self._lock, self._database:
-            self._database.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (now, whole, data))
-            self._bytes += len(data)
-            while self._bytes > self._limit:
-                removed = self._database.execute(
-                    "DELETE FROM records WHERE time IN (SELECT time FROM records ORDER BY time LIMIT 50)"
-                    " RETURNING LENGTH(data)"
-                ).fetchall()
-                self._bytes -= sum(length for (length,) in removed)
+        with self._lock:
+            with self._database:
+                kept = self._bytes + len(data)
+                if whole:
+                    kept -= self._run_removal(_REMOVE_LATER, now)
+                self._database.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (now, whole, data))
+                while kept > self._limit:
+                    kept -= self._run_removal(_REMOVE_OLDEST)
+            self._bytes = kept
+
+    def _run_removal(self, statement: str, *values: float) -> int:
+        """Remove records; return how many bytes they had."""
+        return sum(length for (length,) in self._database.execute(statement, values).fetchall())
 
     def add_figures(self, now: float, figures: dict[str, float]) -> None:
-        """Write figures of the fleet, seconds since 1970; remove those of yesterday."""
+        """Write figures of the fleet, seconds since 1970; remove those of yesterday, and of later times.
+
+        Raises:
+            sqlite3.Error: They cannot be written.
+        """
         with self._lock, self._database:
+            outside = (now - FIGURES_LAST_S, now)
+            self._database.execute("DELETE FROM figures WHERE time < ? OR time > ?", outside)
             self._database.execute("INSERT OR REPLACE INTO figures VALUES (?, ?)", (now, json.dumps(figures)))
-            self._database.execute("DELETE FROM figures WHERE time < ?", (now - FIGURES_LAST_S,))
 
     def figures(self, since: float) -> list[tuple[float, dict[str, float]]]:
         """Return the figures from a time on, seconds since 1970, the oldest first."""
@@ -167,23 +186,33 @@ def _merge(state: Frame, frame: Frame) -> None:
     state |= {key: frame[key] for key in ("blocked", "pending") if key in frame}
 
 
+def _ignore(text: str, tone: str) -> None:
+    del text, tone
+
+
 class Recorder:
     """Records a fleet's view.
 
     Args:
         view: What is recorded.
         records: Where.
+        on_event: Called with text and tone when records cannot be written, and when they can again.
     """
 
-    def __init__(self, view: FleetView, records: Records) -> None:
+    def __init__(
+        self, view: FleetView, records: Records, on_event: Callable[[str, str], None] = _ignore
+    ) -> None:
         self.records = records
         self._view = view
+        self._on_event = on_event
+        self._fails = False
+        self._taken_at = float("-inf")
         self._last: dict[str, list[Any]] = {}
         self._cells: dict[str, list[int]] = {}
         self._whole_at = float("-inf")
 
     async def run(self) -> None:
-        """Write records until cancelled. A full disk ends the recording, not the station."""
+        """Write records until cancelled. On a full disk, it begins anew once there is room."""
         while True:
             await asyncio.sleep(RECORD_EVERY_S)
             made = self.take(time.time())
@@ -193,8 +222,19 @@ class Recorder:
             try:
                 await asyncio.to_thread(self.records.add, now, frame, whole=whole)
             except sqlite3.Error as error:
-                _log.warning("the recording for replays has ended: %s", error)
-                return
+                self._whole_at = float("-inf")  # the next record cannot be a change of this one
+                self._tell(f"nothing is recorded for replays now: {error}")
+            else:
+                self._tell("")
+
+    def _tell(self, trouble: str) -> None:
+        """Tell that records cannot be written, or can again, once."""
+        if bool(trouble) is self._fails:
+            return
+        self._fails = bool(trouble)
+        text = trouble or "the recording for replays continues"
+        _log.log(logging.WARNING if trouble else logging.INFO, "%s", text)
+        self._on_event(text, "bad" if trouble else "good")
 
     def take(self, now: float) -> tuple[float, Frame, bool] | None:
         """Return the record of this moment, and whether it is whole; None if nothing changed.
@@ -205,7 +245,8 @@ class Recorder:
         if self._view.map() is None:
             return None
         # A clock that is set back begins anew, too.
-        whole = not 0.0 <= now - self._whole_at < WHOLE_EVERY_S
+        whole = now < self._taken_at or now - self._whole_at >= WHOLE_EVERY_S
+        self._taken_at = now
         robots = {robot["id"]: self._row(robot) for robot in self._view.robots()}
         cells = {"blocked": self._view.blocked(), "pending": self._view.pending()}
         frame: Frame = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +11,9 @@ from pathlib import Path
 import pytest
 from unit.station.test_station_view import changes, pose, robot, state
 
-from rce_fleet.station.recording import WHOLE_EVERY_S, Recorder, Records, open_records
+from rce.aio.tasks import cancel_and_wait
+from rce_fleet.station import recording
+from rce_fleet.station.recording import WHOLE_EVERY_S, Frame, Recorder, Records, open_records
 from rce_fleet.station.view import FleetView
 
 START = 1000.0
@@ -64,6 +68,69 @@ def test_a_clock_that_is_set_back_begins_with_a_whole_record(view: FleetView, re
     whole = recorder.records.read(START, 10.0)[0]
     assert (whole["time"], whole["robots"]["Robot1"][:2]) == (START, [3.0, 0.5])
     assert set(whole["robots"]) == {"Robot1", "Robot2"}
+
+
+def test_a_clock_that_is_set_back_takes_its_own_records_back(view: FleetView) -> None:
+    """A replay would mix both times. At its bound, each new record was the first to make room."""
+    with closing(Records(limit=3000)) as records:
+        recorder = Recorder(view, records)
+        for second in range(200):
+            view.on_pose("Robot1", pose(0.1 * second, 0.5, 0.0))
+            record(recorder, START + 7200 + second)
+        for second in range(100):
+            view.on_pose("Robot1", pose(50.0 + second, 0.5, 0.0))
+            record(recorder, START + 7100 + second)
+        assert (records.range() or (0.0, 0.0))[1] == START + 7199
+        assert records.read(START + 7190.5, 0.0)[0]["robots"]["Robot1"][0] == 140.0
+        assert len(records.read(START + 7190.5, 10.0)) == 10
+
+
+def test_a_clock_that_is_set_back_a_little_begins_anew(view: FleetView, records: Records) -> None:
+    recorder = Recorder(view, records)
+    for moment in (0, 1, 2, 3, 1.5):
+        view.on_pose("Robot1", pose(moment, 0.5, 0.0))
+        record(recorder, START + moment)
+    assert records.range() == (START, START + 1.5)
+
+
+class FullDisk(Records):
+    """Refuses some records."""
+
+    refuses = 2
+
+    def add(self, now: float, frame: Frame, *, whole: bool) -> None:
+        if self.refuses:
+            self.refuses -= 1
+            raise sqlite3.OperationalError("database or disk is full")
+        super().add(now, frame, whole=whole)
+
+
+async def test_a_full_disk_does_not_end_the_recording(
+    view: FleetView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It begins with a whole record once there is room; the page is told of both."""
+    monkeypatch.setattr(recording, "RECORD_EVERY_S", 0.01)
+    told: list[tuple[str, str]] = []
+    with closing(FullDisk()) as records:
+        running = asyncio.create_task(Recorder(view, records, lambda *event: told.append(event)).run())
+        async with asyncio.timeout(60):
+            while not running.done() and len(told) < 2:
+                await asyncio.sleep(0.01)
+        await cancel_and_wait(running)
+        span = records.range()
+        assert span is not None
+        assert set(records.read(span[0], 0.0)[0]["robots"]) == {"Robot1", "Robot2"}
+    assert told == [
+        ("nothing is recorded for replays now: database or disk is full", "bad"),
+        ("the recording for replays continues", "good"),
+    ]
+
+
+def test_figures_of_later_times_are_removed(records: Records) -> None:
+    """They are of a clock that was ahead."""
+    for moment in (START, START + 3600, START + 10):
+        records.add_figures(moment, {"moving": 1.0})
+    assert [moment for moment, _ in records.figures(0.0)] == [START, START + 10]
 
 
 def test_nothing_is_written_while_nothing_changes(view: FleetView, records: Records) -> None:
