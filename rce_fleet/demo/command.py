@@ -27,6 +27,7 @@ from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import RandomGoals, send_random_goals
 from rce_fleet.demo.resources import ANY, MAX_PORT, Ports, run_folder
 from rce_fleet.demo.scenario import MANY, choose_scenario, find_lanes, lane_scenario
+from rce_fleet.demo.speed import tell_speed
 from rce_fleet.demo.worlds import NamedWorld, find_world, on_lanes
 from rce_fleet.exceptions import FleetError
 from rce_fleet.planning.lanes import LaneGraph
@@ -365,16 +366,15 @@ async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: b
         station = StationClient(session, demo.page)
         rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
         goals = RandomGoals(rng, None if config.lanes is None else config.goal_cells)
-        await demo.group.run_while_alive(
-            send_random_goals(station, goals, say, has_manager=config.mode is Mode.CLOUD)
-            if auto
-            else _wait_until_cancelled()
-        )
+        works = [tell_speed(demo.truth, say)]
+        if auto:
+            works.append(send_random_goals(station, goals, say, has_manager=config.mode is Mode.CLOUD))
+        await demo.group.run_while_alive(_together(works))
     return 0
 
 
-async def _wait_until_cancelled() -> None:
-    await asyncio.Event().wait()
+async def _together(works: Iterable[Coroutine[Any, Any, None]]) -> None:
+    await asyncio.gather(*works)
 
 
 def _run(work: Coroutine[Any, Any, int], *, stopped: int) -> int:

@@ -104,7 +104,8 @@ class RunReport:
         """What a good run did, in words."""
         if self.tasks is not None:
             return self.tasks.summary
-        return f"all robots reached their goals in {self._duration:.2f} s"
+        factor = 0.0 if self.run is None else self.run.speed.factor
+        return f"all robots reached their goals in {self._duration:.2f} s, real-time factor {factor:.2f}"
 
     @property
     def _duration(self) -> float:
@@ -114,12 +115,14 @@ class RunReport:
     def as_json(self) -> dict[str, Any]:
         """Return the report as it is written to the file."""
         truth, run, totals = self.truth, self.run, self.totals
+        driven = run or self.tasks
         blocked = [] if run is None else run.blocker.done
         return {
             "ok": self.ok,
             "mode": self.mode.value,
             **({} if self.explored is None else {"exploration": self.explored.as_json()}),
             "duration_s": self._duration,
+            "real_time_factor": None if driven is None else round(driven.speed.factor, 3),
             **({} if self.tasks is None else self.tasks.as_json()),
             "collisions": None if truth is None else truth.collisions.total,
             "min_separation_m": None if truth is None else truth.min_separation_m,

@@ -8,6 +8,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, assert_never
 
 from rce_fleet.demo.blocking import BlockAction, CellBlocker
+from rce_fleet.demo.speed import WorldSpeed
 from rce_fleet.drivers.report import WorldReport
 from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
 from rce_fleet.planning.scenario import Scenario
@@ -37,6 +38,7 @@ class ScenarioRun:
         reached: Robots that stand at their goals, both as reported by the planner and in the world.
         replans: How often each robot got a new path.
         blocker: The cells that are blocked on the way.
+        speed: How fast the simulated world runs.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class ScenarioRun:
         self.reached: set[str] = set()
         self.replans = dict.fromkeys(scenario.robots, 0)
         self.blocker = CellBlocker(scenario.grid, self.goals, blocked_cells)
+        self.speed = WorldSpeed()
         self._station = station
         self._truth = truth
         self._say = say
@@ -94,6 +97,8 @@ class ScenarioRun:
         self._started = time.monotonic()
         while True:
             fleet, truth = await self._read_fleet(), self._truth()
+            if truth is not None:
+                self.speed.look(truth, time.monotonic())
             if fleet is not None and truth is not None:
                 self._count_replans(fleet)
                 self._update_reached(fleet, truth)

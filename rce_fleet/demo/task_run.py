@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.speed import WorldSpeed
 from rce_fleet.demo.standstill import Standstill
 from rce_fleet.exceptions import StationUnavailableError
 from rce_fleet.wiring import FLEET_CONTAINER
@@ -61,6 +62,7 @@ class TaskRun:
     Attributes:
         tasks: The stream.
         standstill: How long robots stood.
+        speed: How fast the simulated world runs.
         planner_kills: How often the planner was killed.
         replans: How often each robot got a new path.
     """
@@ -88,9 +90,7 @@ class TaskRun:
         self._kill_planner = kill_planner
         self._say = say
         self._poll = poll_s(robots)
-        self._began: tuple[float, float] | None = None
-        self._streamed = 0.0
-        self._simulated = 0.0
+        self.speed = WorldSpeed()
 
     async def run(self) -> None:
         """Wait until all robots are there, stream tasks, and wait for the last ones."""
@@ -120,18 +120,13 @@ class TaskRun:
         return (
             f"{self.tasks.done} tasks done ({self.tasks_per_hour:.0f} per hour), {self.tasks.open} open, "
             f"longest standstill {self.standstill.longest:.0f} s, "
-            f"real-time factor {self.real_time_factor:.2f}"
+            f"real-time factor {self.speed.factor:.2f}"
         )
 
     @property
     def tasks_per_hour(self) -> float:
         """Tasks done in an hour, by the time of the simulated world."""
-        return 3600 * self.tasks.done / self._simulated if self._simulated else 0.0
-
-    @property
-    def real_time_factor(self) -> float:
-        """Simulated seconds per second."""
-        return self._simulated / self._streamed if self._streamed else 0.0
+        return 3600 * self.tasks.done / self.speed.simulated if self.speed.simulated else 0.0
 
     @property
     def faults(self) -> list[str]:
@@ -160,13 +155,12 @@ class TaskRun:
             "tasks_per_hour": round(self.tasks_per_hour, 1),
             "planner_kills": self.planner_kills,
             "longest_standstill_s": round(self.standstill.longest, 1),
-            "real_time_factor": round(self.real_time_factor, 3),
         }
 
     @property
     def duration(self) -> float:
         """Seconds since the first task."""
-        return self._streamed
+        return self.speed.seconds
 
     @property
     def _next_kill(self) -> float:
@@ -185,9 +179,7 @@ class TaskRun:
     async def _step(self, *, more: bool) -> None:
         fleet, truth, now = await self._read_fleet(), self._truth(), time.monotonic()
         if truth is not None:
-            if self._began is None:
-                self._began = (now, truth.time_s)
-            self._streamed, self._simulated = now - self._began[0], truth.time_s - self._began[1]
+            self.speed.look(truth, now)
             self.standstill.update(truth, self.tasks.busy)
         if fleet is not None:
             await self.tasks.update(fleet, more=more)

@@ -23,6 +23,8 @@ def make_report(reached: set[str], problem: str = "", collisions: int = 0) -> Ru
     unused: Any = None
     run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
     run.reached = reached
+    for second in (1.0, 3.0):
+        run.speed.look(truth({}).model_copy(update={"time_s": 0.75 * second}), second)
     score = RobotScore()
     for error in (0.01, 0.07):
         score.compare(error)
@@ -45,6 +47,7 @@ def test_report_of_a_good_run() -> None:
     assert report["ok"] is True
     assert report["collisions"] == 0
     assert report["min_separation_m"] == 0.5
+    assert report["real_time_factor"] == 0.75
     assert report["engine"] == {"messages": 10, "dropped": 1}
     assert report["robots"] == [
         {
