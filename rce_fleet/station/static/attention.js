@@ -7,6 +7,7 @@ import { t } from "./texts.js";
 
 const DRAW_EVERY_MS = 1000;
 const MOST = 20;
+const MORE = 100;
 const MOST_NAMES = 100;
 
 const ANSWERS = {
@@ -20,6 +21,7 @@ const ANSWERS = {
 };
 
 export class Attention {
+  #most = MOST; // rows that are shown
   #open = new Set(); // kinds of groups whose robots are shown
 
   // answer: (name, robot) => does it; answerTask: (name, task, cell)
@@ -42,8 +44,9 @@ export class Attention {
     const tasks = taskConditionsOf(this.work);
     this.count.textContent = whole.length + found.length + tasks.length || "";
     const rows = [...rowsOf(found, this.fleet.stoppedBy !== null), ...tasks].sort((a, b) => b.conditions[0].severity - a.conditions[0].severity);
-    const shown = rows.slice(0, MOST);
-    const hidden = rows.slice(MOST).reduce((count, { robots }) => count + (robots?.length ?? 1), 0);
+    if (rows.length <= MOST) this.#most = MOST;
+    const shown = rows.slice(0, this.#most);
+    const hidden = rows.slice(this.#most).reduce((count, { robots }) => count + (robots?.length ?? 1), 0);
     const before = new Map([...this.list.children].map((item) => [item.dataset.key, item]));
     // An item is made again only when something else than the text of its conditions changes.
     const item = (parts, make) => {
@@ -58,7 +61,7 @@ export class Attention {
       made.querySelector(".why").textContent = row.conditions.map(({ text }) => text).join("; ");
       items.push(made);
     }
-    if (hidden) items.push(item(["more", hidden], () => element("li", t("attention.more", { count: hidden }), "quiet")));
+    if (hidden) items.push(item(["more", hidden], () => this.#moreItem(hidden)));
     if (!items.length) items.push(item(["none"], () => element("li", t("attention.none"), "quiet")));
     this.#place(items);
   }
@@ -88,6 +91,19 @@ export class Attention {
     const sign = element("span", isSevere ? "!!" : "!", "sign");
     sign.setAttribute("aria-hidden", "true");
     item.append(sign, ...content);
+    return item;
+  }
+
+  #moreItem(count) {
+    const item = element("li", "", "quiet");
+    const button = element("button", t("attention.more", { count }), "link");
+    button.type = "button";
+    button.dataset.answer = "more";
+    button.addEventListener("click", () => {
+      this.#most += MORE;
+      this.draw();
+    });
+    item.append(button);
     return item;
   }
 

@@ -18,6 +18,8 @@ export function isPossible(answer, fleet) {
   return fleet.manager || !NEEDS_MANAGER.has(answer);
 }
 
+const OUT_MODES = new Set(["out_of_service", "dead"]);
+
 // The planner hears these: one that gives it no sign of life for a few seconds is "silent".
 const HEARD = new Set(["driving", "waiting", "arrived", "idle", "unreachable", "lost"]);
 
@@ -38,6 +40,9 @@ export function markOf(robot) {
   return TROUBLE.has(robot.state) ? MARK.trouble : MARK.none;
 }
 
+// Whether people have taken a robot from the fleet, until they put it in: it may be switched off, and waits for nothing.
+export const isOut = ({ mode, ownMode, activity }) => activity === "out" || OUT_MODES.has(mode) || OUT_MODES.has(ownMode);
+
 // All that is wrong with a robot, worst first: {kind, severity (4 is worst), text}.
 export function conditionsOf(robot, now = performance.now()) {
   const found = [];
@@ -45,6 +50,7 @@ export function conditionsOf(robot, now = performance.now()) {
   const age = heartbeatAge(robot, now);
   if (robot.undelivered) add("undelivered", 4, t("condition.undelivered", { user: robot.emergency }));
   else if (robot.emergency) add("emergency", 3, t("condition.emergency", { user: robot.emergency }));
+  if (isOut(robot)) return found;
   if (robot.state === "silent") add("offline", 3, [robot.reason || t("condition.silent"), age !== null && t("condition.offline", { seconds: Math.round(age) })].filter(Boolean).join("; "));
   else if (age !== null && age > OFFLINE_S && robot.state !== "joining" && !HEARD.has(robot.state)) add("offline", 2, t("condition.offline", { seconds: Math.round(age) }));
   if (robot.state === "unreachable") add("stuck", 3, robot.reason || t("condition.unreachable", { cell: robot.goal ?? "?" }));

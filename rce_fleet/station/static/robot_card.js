@@ -1,7 +1,7 @@
 // The selected robot: its state, and what can be done with it.
 
 import { element } from "./engine.js";
-import { heartbeatAge, isPossible } from "./conditions.js";
+import { heartbeatAge, isOut, isPossible } from "./conditions.js";
 import { t } from "./texts.js";
 
 const ANSWERS = ["drive", "localize", "charge", "reassign", "cancel"];
@@ -22,7 +22,7 @@ export class RobotCard {
     this.box.hidden = !robot || !this.steers;
     if (this.box.hidden) return;
     const paused = ["paused", "stopped"].includes(robot.ownMode); // a robot of a paused fleet is not, and cannot be resumed
-    const out = robot.activity === "out" || robot.mode === "out_of_service";
+    const out = isOut(robot);
     const stops = [...(robot.emergency && !robot.undelivered ? [] : ["stop"]), ...(robot.emergency ? ["release"] : [])];
     const names = [...stops, paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));
     const key = [robot.id, ...names].join();
