@@ -49,6 +49,10 @@ class Places:
     def __len__(self) -> int:
         return self._taken.total()
 
+    def of(self, holder: str) -> int:
+        """Return how many places a holder has."""
+        return self._taken[holder]
+
     @contextlib.contextmanager
     def place(self, holder: str) -> Iterator[None]:
         """Have a place as long as the context lasts.

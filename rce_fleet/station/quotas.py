@@ -25,6 +25,8 @@ STREAMS_EACH, MAX_STREAMS = 50, 500
 """Open streams of events, and histories that are being sent as CSV: of a user, and of all at one station."""
 PAGES_EACH, MAX_PAGES = 50, 250
 """Open pages. At a station without logins all of them are one user's."""
+REQUESTS_PER_PAGE = 8.0
+"""What an open page may ask for in a second beside that: it reads the manager every two seconds."""
 
 
 class StationQuotas:
@@ -47,6 +49,7 @@ class StationQuotas:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._rates = Rates(per_second=requests, burst=burst)
+        self._requests = requests
         self._clock = clock
         self.streams = Places(each=STREAMS_EACH, most=MAX_STREAMS)
         self.pages = Places(each=PAGES_EACH, most=MAX_PAGES)
@@ -55,7 +58,9 @@ class StationQuotas:
         """Count a request; return the seconds after which to ask again, 0: it is allowed."""
         if user.role == "admin":
             return 0
-        return math.ceil(self._rates.take(user.name, self._clock()))
+        # With pages, each request takes a smaller part of the same bucket.
+        share = self._requests / (self._requests + REQUESTS_PER_PAGE * self.pages.of(user.name))
+        return math.ceil(self._rates.take(user.name, self._clock(), share))
 
 
 def why_no_place(what: str, error: NoPlaceError) -> str:

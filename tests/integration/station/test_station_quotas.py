@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,8 +14,9 @@ from support.fleet_station import RoleAuthenticator
 
 from rce.guard import Places
 from rce_fleet.station import access
+from rce_fleet.station.authentication import StationUser
 from rce_fleet.station.feed import Feed
-from rce_fleet.station.quotas import StationQuotas
+from rce_fleet.station.quotas import PAGES_EACH, REQUESTS_PER_PAGE, REQUESTS_PER_S, StationQuotas
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -64,6 +65,23 @@ async def test_requests_of_one_user_are_bounded(monkeypatch: pytest.MonkeyPatch)
         clock.now = 1.0
         assert await statuses(OPERATOR, 2) == {200}
         assert await statuses(OPERATOR, 1) == {429}
+
+
+def test_requests_of_all_pages_fit_beside_other_requests() -> None:
+    """Half of the pages that a user may open took all of the user's requests, so that clicks were refused."""
+    clock, user = Clock(), StationUser("operator", "operator")
+    quotas = StationQuotas(clock=clock)
+    with ExitStack() as stack:
+        for _ in range(PAGES_EACH):
+            stack.enter_context(quotas.pages.place(user.name))
+        while not quotas.request(user):
+            pass
+        for clock.now in range(1, 61):
+            asked = int(REQUESTS_PER_S + PAGES_EACH * REQUESTS_PER_PAGE)
+            assert [quotas.request(user) for _ in range(asked)] == [0] * asked
+            assert quotas.request(user) == 1
+    clock.now += 1
+    assert sum(not quotas.request(user) for _ in range(1000)) == REQUESTS_PER_S
 
 
 async def test_pages_are_bounded_for_each_user_and_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
