@@ -24,6 +24,7 @@ from rce_fleet.cli.access import (
     set_token,
 )
 from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
+from rce_master.cli.exceptions import CliError
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
@@ -41,7 +42,19 @@ def fleet(token: Token = "", send_login: SendLogin = False) -> None:
 
 
 Robot = Annotated[str, typer.Argument(help="The robot.")]
+RobotOrAll = Annotated[str, typer.Argument(help="The robot; or --all.")]
+All = Annotated[bool, typer.Option("--all", help="All robots.")]
 Reason = Annotated[str, typer.Option(help="For people.")]
+
+
+def _check_choice(robot: str, *, is_all: bool) -> None:
+    """Check that a command names a robot, or all of them.
+
+    Raises:
+        typer.BadParameter: It names both or none.
+    """
+    if bool(robot) is is_all:
+        raise typer.BadParameter("name one robot, or give --all")
 
 
 @app.command("robots")
@@ -91,21 +104,50 @@ def stop(robot: Robot, station: Station = STATION) -> None:
 
 
 @app.command("pause")
-def pause(robot: Robot, reason: Reason = "", station: Station = STATION) -> None:
-    """Let a robot stand still; it keeps its task."""
+def pause(robot: RobotOrAll = "", all_: All = False, reason: Reason = "", station: Station = STATION) -> None:
+    """Let a robot, or the whole fleet, stand still."""
+    _check_choice(robot, is_all=all_)
 
     async def work(client: FleetClient) -> None:
-        typer.echo(f"{robot} is {(await client.pause_robot(robot, reason)).activity}")
+        if all_:
+            typer.echo(await client.set_mode("paused", reason) or "the fleet is paused")
+        else:
+            typer.echo(f"{robot} is {(await client.pause_robot(robot, reason)).activity}")
 
     do(station, work)
 
 
 @app.command("resume")
-def resume(robot: Robot, station: Station = STATION) -> None:
-    """End a robot's pause, emergency stop or manual mode."""
+def resume(robot: RobotOrAll = "", all_: All = False, station: Station = STATION) -> None:
+    """End a robot's pause, emergency stop or manual mode, or the fleet's pause."""
+    _check_choice(robot, is_all=all_)
 
     async def work(client: FleetClient) -> None:
-        typer.echo(f"{robot} is {(await client.resume_robot(robot)).activity}")
+        if all_:
+            typer.echo(await client.set_mode("automatic") or "the fleet drives")
+        else:
+            typer.echo(f"{robot} is {(await client.resume_robot(robot)).activity}")
+
+    do(station, work)
+
+
+@app.command("emergency-stop")
+def emergency_stop(
+    robot: RobotOrAll = "",
+    all_: All = False,
+    release: Annotated[bool, typer.Option("--release", help="Release what was stopped.")] = False,
+    station: Station = STATION,
+) -> None:
+    """Stop a robot, or all of them, at once and without the planner."""
+    _check_choice(robot, is_all=all_)
+
+    async def work(client: FleetClient) -> None:
+        missed = await client.emergency_stop(robot, stopped=not release)
+        if missed:
+            raise CliError(
+                f"not reached yet: {', '.join(map(one_line, missed))}; they get it when they come back"
+            )
+        typer.echo(f"{robot or 'all robots'}: {'released' if release else 'stopped'}")
 
     do(station, work)
 

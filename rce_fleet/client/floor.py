@@ -57,6 +57,16 @@ class FloorRequests(ApiRequests):
         """
         return (await self._read("/zones", ZoneList)).zones
 
+    async def zone(self, name: str) -> ZoneModel:
+        """Return a zone.
+
+        Example:
+            ```python
+            print((await fleet.zone("gate")).revision)
+            ```
+        """
+        return await self._read(f"/zones/{path_part(name)}", ZoneModel)
+
     async def set_zone(self, name: str, zone: ZoneRequest, *, revision: int | None = None) -> ZoneModel:
         """Make or replace a zone.
 

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from rce_fleet.api.fleet import FleetRobotModel, ProfileModel, RobotChange, RobotList
+import json
+from typing import Literal
+
+from pydantic import BaseModel
+
+from rce_fleet.api.fleet import FleetModeChange, FleetRobotModel, ProfileModel, RobotChange, RobotList
 from rce_fleet.api.tasks import HoldRequest
-from rce_fleet.client.requests import ApiRequests, path_part
-from rce_fleet.station.api import GoalRequest
+from rce_fleet.client.requests import ApiRequests, parsed, path_part
+from rce_fleet.station.api import Answer, GoalRequest
+
+
+class _Reached(BaseModel):
+    """What an emergency stop has reached."""
+
+    missed: list[str]
 
 
 class RobotRequests(ApiRequests):
@@ -27,6 +38,16 @@ class RobotRequests(ApiRequests):
             if page.next is None:
                 return robots
             query["cursor"] = page.next
+
+    async def robot(self, name: str) -> FleetRobotModel:
+        """Return a robot: its task and queue, battery, loads, profile and revision.
+
+        Example:
+            ```python
+            print((await fleet.robot("Robot1")).battery)
+            ```
+        """
+        return await self._read(f"/robots/{path_part(name)}/manager", FleetRobotModel)
 
     async def change_robot(
         self, robot: str, profile: ProfileModel | None, *, revision: int | None = None
@@ -91,6 +112,35 @@ class RobotRequests(ApiRequests):
         """
         body = GoalRequest(cell=cell).model_dump_json()
         await self._transport.request("PUT", f"/robots/{path_part(robot)}/goal", body=body)
+
+    async def set_mode(self, mode: Literal["automatic", "paused"], reason: str = "") -> str:
+        """Pause the whole fleet, or let it drive again; return the answer for people.
+
+        Example:
+            ```python
+            await fleet.set_mode("paused", "fire drill")
+            ```
+        """
+        return (await self._send("PUT", "/mode", Answer, FleetModeChange(mode=mode, reason=reason))).message
+
+    async def emergency_stop(self, robot: str = "", *, stopped: bool = True) -> list[str]:
+        """Stop a robot, or all of them, at once and without the planner; or release them.
+
+        Args:
+            robot: The robot; empty: all, also those that appear later.
+            stopped: False: release them.
+
+        Returns:
+            Robots that were not reached; they get it when they come back.
+
+        Example:
+            ```python
+            missed = await fleet.emergency_stop()
+            ```
+        """
+        path = f"/robots/{path_part(robot)}/emergency-stop" if robot else "/emergency-stop"
+        text = await self._transport.request("PUT", path, body=json.dumps({"stopped": stopped}))
+        return parsed(_Reached, text).missed
 
     async def _robot(self, robot: str, action: str, reason: str | None) -> FleetRobotModel:
         body = None if reason is None else HoldRequest(reason=reason)

@@ -264,6 +264,7 @@ async def _page(call: Call, query: EventQuery) -> FleetAnswer:
 ROUTES = [
     Route("GET", "/robots", robots),
     Route("GET", "/robots/{id}", robot),
+    Route("GET", "/robots/{id}/manager", robot),
     Route("PATCH", "/robots/{id}", change_robot, changes=True),
     Route("POST", "/robots/{id}/pause", pause, changes=True),
     Route("POST", "/robots/{id}/resume", resume, changes=True),

@@ -276,6 +276,11 @@ ROUTES: list[Route[str]] = [
         query=(_CURSOR, _LIMIT),
     ),
     _route(
+        *("GET", "/robots/{robot}/manager", "", "Return a robot as the fleet manager knows it"),
+        reply=FleetRobotModel,
+        name="get_managed_robot",
+    ),
+    _route(
         *("PATCH", "/robots/{robot}", "change_robot", "Change what a robot can do"),
         body=RobotChange,
         reply=FleetRobotModel,

@@ -72,7 +72,7 @@ async def check_commands(url: str, folder: Path) -> None:
     lines = [
         line[2:] for line in block("console", "$ rce fleet").splitlines() if line.startswith("$ rce fleet")
     ]
-    assert len(lines) == 20
+    assert len(lines) == 22
     said = {}
     for line in lines:
         words = [waiting if word == "T1" else word for word in shlex.split(line.partition(" > ")[0])]
@@ -85,6 +85,7 @@ async def check_commands(url: str, folder: Path) -> None:
     assert said["task hold"] == f"{waiting} is held\n"
     assert "Robot1" in next(text for words, text in said.items() if words.startswith("robots"))
     assert "out" in said["take-out Robot2"]
+    assert "paused" in said["pause --all"]
     assert said["block 17"] == "cell 17 is blocked\ncell 18 is blocked\n"
     assert said["block 26"].startswith("cell 26 is blocked until ")
     assert said["block 33>34"].startswith("the move 33>34 is blocked for Robot1 until ")

@@ -20,6 +20,7 @@ from aiohttp.test_utils import TestServer
 from support.fleet_station import RoleAuthenticator, fleet_station
 from support.managed_fleet import ManagedFleet, managed_fleet
 
+from rce_fleet.api.fleet import ProfileModel, ZoneRequest
 from rce_fleet.api.tasks import StopModel, TaskChange, TaskRequest
 from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, WebhookRequest, verify
 from rce_fleet.client import ApiError, EventsRestartedError, FleetClient, NotFoundError, OutdatedError
@@ -245,6 +246,16 @@ async def check_client(fleet: ManagedFleet) -> None:
             await client.create_task(TaskRequest(stops=[StopModel(cell=10_000)]))
         await client.set_blocked(62, blocked=True)
         await client.set_blocked(62, blocked=False)
+        assert await client.robot("Robot1") in await client.robots()
+        changed_robot = await client.change_robot("Robot1", ProfileModel(payload=20))
+        assert (await client.robot("Robot1")).revision == changed_robot.revision
+        with pytest.raises(NotFoundError, match="Robot77"):
+            await client.robot("Robot77")
+        zone = await client.set_zone("gate", ZoneRequest(kind="slow", cells=[62], value=0.2))
+        assert await client.zone("gate") == zone
+        await client.remove_zone("gate")
+        for mode in ("paused", "automatic"):
+            assert await client.set_mode(mode, "fire drill")
         assert {robot.id for robot in (await client.fleet()).robots} == {"Robot1", "Robot2"}
         assert (await client.statistics()).robots == 2
 

@@ -27,6 +27,7 @@ from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
 from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
 from rce_fleet.cli.commands import app as commands
 from rce_fleet.station.api import Answer
+from rce_fleet.station.commands.routes import StopAnswer
 from rce_master.cli.credentials import FILE_VARIABLE
 
 TOKEN = "of-the-login"
@@ -96,6 +97,7 @@ class Station:
         self.bodies: list[Any] = []
         self.changes: list[str] = []
         self.zones: list[str] = []
+        self.missed: list[str] = []
         self.has_manager = True
         self.lost = 0
         """How many answers to changes are lost."""
@@ -121,6 +123,10 @@ class Station:
 
     def shown(self, path: str, method: str) -> BaseModel:
         """Return what the station answers to a request."""
+        if path.endswith("emergency-stop"):
+            return StopAnswer(message="", missed=self.missed)
+        if path == "mode":
+            return Answer(message="")
         if path.startswith("robots/"):
             return ROBOT
         if path.startswith("zones/"):
@@ -331,6 +337,43 @@ async def test_rce_fleet_does_what_waits_for_people(
     code, told = await run(url, *words.split())
     assert (code, station.changes) == (0, [change]), told
     assert station.bodies == ([] if body is None else [body])
+
+
+@pytest.mark.parametrize(
+    ("words", "change", "body", "told"),
+    [
+        (
+            "pause --all --reason fire",
+            "PUT mode",
+            {"mode": "paused", "reason": "fire"},
+            "the fleet is paused",
+        ),
+        ("resume --all", "PUT mode", {"mode": "automatic", "reason": ""}, "the fleet drives"),
+        ("emergency-stop --all", "PUT emergency-stop", {"stopped": True}, "all robots: stopped"),
+        (
+            *("emergency-stop R1 --release", "PUT robots/R1/emergency-stop"),
+            *({"stopped": False}, "R1: released"),
+        ),
+    ],
+)
+async def test_rce_fleet_stops_the_whole_fleet(
+    station: Station, url: str, words: str, change: str, body: Any, told: str
+) -> None:
+    assert await run(url, *words.split()) == (0, f"{told}\n")
+    assert (station.changes, station.bodies) == ([change], [body])
+
+
+async def test_rce_fleet_tells_who_was_not_stopped(station: Station, url: str) -> None:
+    station.missed = ["R2", "R3"]
+    code, told = await run(url, "emergency-stop", "--all")
+    assert (code, "not reached yet: R2, R3;" in told) == (1, True)
+
+
+@pytest.mark.parametrize("words", ["pause", "resume R1 --all", "emergency-stop"])
+async def test_rce_fleet_stops_one_robot_or_all(station: Station, url: str, words: str) -> None:
+    code, told = await run(url, *words.split())
+    assert (code, station.changes) == (2, [])
+    assert "name one robot, or give --all" in " ".join(told.replace("│", " ").split())
 
 
 async def test_rce_fleet_shows_a_question_with_its_answer(url: str) -> None:

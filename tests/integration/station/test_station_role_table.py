@@ -27,6 +27,7 @@ VIEWERS = {
     "GET /fleet",
     "GET /robots",
     "GET /robots/{robot}",
+    "GET /robots/{robot}/manager",
     "GET /tasks",
     "GET /tasks/{id}",
     "GET /chargers",
