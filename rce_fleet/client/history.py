@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 
 from rce_fleet.api.fleet import EventModel, EventPage, StatisticsModel
 from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookModel, WebhookRequest
@@ -27,7 +27,13 @@ class HistoryRequests(ApiRequests):
         return await self._read("/statistics", StatisticsModel, {"seconds": f"{seconds:g}"})
 
     async def history(
-        self, *, since: float | None = None, until: float | None = None, subject: str = ""
+        self,
+        *,
+        since: float | None = None,
+        until: float | None = None,
+        subject: str = "",
+        kinds: Iterable[str] = (),
+        robot: str = "",
     ) -> AsyncIterator[EventModel]:
         """Yield events of a time, the oldest first.
 
@@ -35,6 +41,8 @@ class HistoryRequests(ApiRequests):
             since: Seconds since 1970; None: from the beginning.
             until: Seconds since 1970; None: until now.
             subject: Only of this task, robot or zone.
+            kinds: Only of these kinds, such as ``task``; empty: all.
+            robot: Only those in which this robot took part.
 
         Example:
             ```python
@@ -44,7 +52,8 @@ class HistoryRequests(ApiRequests):
         """
         times = {"since": since, "until": until}
         query = {name: repr(value) for name, value in times.items() if value is not None}
-        query |= {"limit": str(PAGE)} | ({"id": subject} if subject else {})
+        given = {"id": subject, "kind": ",".join(kinds), "robot": robot}
+        query |= {"limit": str(PAGE)} | {name: text for name, text in given.items() if text}
         while True:
             page = await self._read("/history", EventPage, query)
             for event in page.events:

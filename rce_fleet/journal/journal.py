@@ -8,6 +8,7 @@ million events.
 
 from __future__ import annotations
 
+import json
 import secrets
 import sqlite3
 import time
@@ -59,9 +60,11 @@ WITHOUT ROWID;
 """
 _QUERY = """
 SELECT * FROM events
-WHERE number > :after AND time >= :since AND time < :until {of_one} ORDER BY number LIMIT :limit
+WHERE number > :after AND time >= :since AND time < :until {also} ORDER BY number LIMIT :limit
 """
 _OF_ONE = "AND id = :id"
+_OF_KINDS = "AND kind IN (SELECT value FROM json_each(:kinds))"
+_OF_ROBOT = "AND (robot = :robot OR (kind IN ('robot', 'goal') AND id = :robot))"
 """A condition of its own: with ``:id = '' OR id = :id`` SQLite would look at all events, not at the index."""
 _LAST_TASK = """
 SELECT max(CAST(substr(id, 2) AS INTEGER)) FROM (
@@ -83,6 +86,8 @@ class EventQuery:
         until: Only events before this time; None: all.
         id: Only events of this task or robot; empty: all.
         limit: At most so many, the oldest first.
+        kinds: Only events of these kinds; empty: all.
+        robot: Only events in which this robot took part; empty: all.
     """
 
     after: int = 0
@@ -90,6 +95,8 @@ class EventQuery:
     until: float | None = None
     id: str = ""
     limit: int = 1000
+    kinds: tuple[str, ...] = ()
+    robot: str = ""
 
 
 class Journal:
@@ -178,13 +185,16 @@ class Journal:
         Raises:
             JournalError: The file cannot be read.
         """
-        text = _QUERY.format(of_one=_OF_ONE if query.id else "")
+        conditions = ((query.id, _OF_ONE), (query.kinds, _OF_KINDS), (query.robot, _OF_ROBOT))
+        text = _QUERY.format(also=" ".join(condition for wanted, condition in conditions if wanted))
         values = {
             "after": query.after,
             "since": -inf if query.since is None else query.since,
             "until": inf if query.until is None else query.until,
             "id": query.id,
             "limit": query.limit,
+            "kinds": json.dumps(query.kinds),
+            "robot": query.robot,
         }
         rows = self._run(lambda db: db.execute(text, values).fetchall(), "read")
         return [dict(zip(_COLUMNS, row, strict=True)) for row in rows]

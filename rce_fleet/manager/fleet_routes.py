@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from itertools import islice
+from typing import get_args
 
 from rce_fleet.api.fleet import (
     EventModel,
@@ -17,6 +19,7 @@ from rce_fleet.api.fleet import (
     RobotList,
 )
 from rce_fleet.api.tasks import HoldRequest, PutInRequest
+from rce_fleet.api.webhooks import EventKind
 from rce_fleet.exceptions import PlannerSilentError, TaskRefusedError, UnknownTaskError
 from rce_fleet.journal.journal import EventQuery
 from rce_fleet.manager.convert import read_profile, show_profile
@@ -32,24 +35,25 @@ from rce_fleet.tasks.records import AUTOMATIC, RobotEntry
 MOST_EVENTS = 5000
 MOST_ROBOTS = 1000
 """In one page."""
+_OF_EVENTS = ("id", "kind", "robot")
+"""What events can be asked for by."""
 
 
 # Robots
 
 
 async def robots(call: Call) -> FleetAnswer:
-    """Return robots by name: all, or a page of them."""
-    call.only("limit", "cursor")
+    """Return robots by name: all, or a page of them; of some states or activities only."""
+    call.only("limit", "cursor", "state", "activity")
     limit, after = call.count("limit", 0, MOST_ROBOTS), call.query.get("cursor", "")
     names = sorted(name for name in {*call.manager.facts.robots, *call.manager.book.robots} if name > after)
-    page = names[:limit] if limit else names
+    wanted = {field: text.split(",") for field in ("state", "activity") if (text := call.query.get(field))}
     queues = _queues(call)
-    return shown(
-        RobotList(
-            robots=[_show_robot(call, name, queues) for name in page],
-            next=page[-1] if len(names) > len(page) else None,
-        )
-    )
+    found = (_show_robot(call, name, queues) for name in names)
+    fitting = (robot for robot in found if all(getattr(robot, field) in wanted[field] for field in wanted))
+    page = list(islice(fitting, limit or None))
+    more = next(fitting, None) is not None
+    return shown(RobotList(robots=page, next=page[-1].id if more else None))
 
 
 async def robot(call: Call) -> FleetAnswer:
@@ -234,23 +238,34 @@ async def statistics(call: Call) -> FleetAnswer:
 
 async def events(call: Call) -> FleetAnswer:
     """Return events after a number."""
-    call.only("after", "limit", "id")
-    after = call.count("after", 0, 10**17)
-    query = EventQuery(after, id=call.query.get("id", ""), limit=call.count("limit", 1000, MOST_EVENTS))
-    return await _page(call, query)
+    call.only("after", "limit", *_OF_EVENTS)
+    return await _page(call, _event_query(call))
 
 
 async def history(call: Call) -> FleetAnswer:
     """Return events of a time."""
-    call.only("since", "until", "after", "limit", "id")
-    query = EventQuery(
-        call.count("after", 0, 10**17),
-        call.number("since", None),
-        call.number("until", None),
-        call.query.get("id", ""),
-        call.count("limit", 1000, MOST_EVENTS),
+    call.only("since", "until", "after", "limit", *_OF_EVENTS)
+    since, until = call.number("since", None), call.number("until", None)
+    return await _page(call, replace(_event_query(call), since=since, until=until))
+
+
+def _event_query(call: Call) -> EventQuery:
+    """Return which events are asked for.
+
+    Raises:
+        BadRequestError: There is no such kind, or a number is wrong.
+    """
+    kinds = tuple(filter(None, call.query.get("kind", "").split(",")))
+    known = get_args(EventKind)
+    if unknown := sorted({*kinds} - {*known}):
+        raise BadRequestError(f"unknown kind {unknown[0]!r}; possible are {', '.join(known)}")
+    return EventQuery(
+        after=call.count("after", 0, 10**17),
+        id=call.query.get("id", ""),
+        limit=call.count("limit", 1000, MOST_EVENTS),
+        kinds=kinds,
+        robot=call.query.get("robot", ""),
     )
-    return await _page(call, query)
 
 
 async def _page(call: Call, query: EventQuery) -> FleetAnswer:

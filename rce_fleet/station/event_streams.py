@@ -62,7 +62,7 @@ class EventStreams:
         """Return events after a number; with ``Accept: text/event-stream``, follow them."""
         if EVENT_STREAM not in request.headers.get(hdrs.ACCEPT, ""):
             return await self._requests.handle(request, "")
-        if ignored := {"id", "limit"} & request.query.keys():
+        if ignored := {"id", "kind", "limit", "robot"} & request.query.keys():
             return problem(
                 422, f"a stream of events takes no {min(ignored)!r}: it sends all, from 'after' on"
             )

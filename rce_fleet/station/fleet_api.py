@@ -39,6 +39,8 @@ _PAGE = (
     Query(name="after", description="Events after this number.", type="integer"),
     Query(name="limit", description="Most in one answer.", type="integer"),
     Query(name="id", description="Of one task, robot, zone ... only."),
+    Query(name="kind", description="Of these kinds only, separated by commas: task, robot, zone ..."),
+    Query(name="robot", description="Only those in which this robot took part, also of its tasks."),
 )
 _TIME = (
     Query(name="since", description="Seconds since 1970.", type="number"),

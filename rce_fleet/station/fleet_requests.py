@@ -273,7 +273,12 @@ ROUTES: list[Route[str]] = [
     _route(
         *("GET", "/robots", "", "List robots, by name; all of them without limit"),
         reply=RobotList,
-        query=(_CURSOR, _LIMIT),
+        query=(
+            Query(name="state", description="States, separated by commas."),
+            Query(name="activity", description="Activities, separated by commas."),
+            _CURSOR,
+            _LIMIT,
+        ),
     ),
     _route(
         *("GET", "/robots/{robot}/manager", "", "Return a robot as the fleet manager knows it"),

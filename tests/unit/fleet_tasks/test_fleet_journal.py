@@ -64,6 +64,9 @@ def test_events_are_found_by_number_time_and_id(tmp_path: Path) -> None:
     assert [event["number"] for event in journal.events(EventQuery(after=4))] == [5, 6]
     assert [event["name"] for event in journal.events(EventQuery(id="T1"))] == ["created", "held"]
     assert [event["number"] for event in journal.events(EventQuery(since=2.0, until=4.0))] == [2, 3]
+    assert [event["number"] for event in journal.events(EventQuery(kinds=("task", "zone")))] == [1, 2, 5]
+    assert [event["number"] for event in journal.events(EventQuery(robot="Robot1"))] == [3]
+    assert journal.events(EventQuery(kinds=("task",), robot="Robot1")) == []
     assert len(journal.events(EventQuery(limit=3))) == 3
     journal.forget_events(5)
     assert [event["number"] for event in journal.events(EventQuery())] == [5, 6]

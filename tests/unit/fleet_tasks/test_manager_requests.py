@@ -36,6 +36,40 @@ async def test_pages_of_tasks_follow_each_other(client: ManagerClient) -> None:
     assert ([task["id"] for task in ended["tasks"]], ended["next"]) == (["T3"], None)
 
 
+async def test_events_are_asked_for_by_kind_and_robot(client: ManagerClient) -> None:
+    await client.ask("POST", "/tasks", GO)
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=3)
+    await client.ask("POST", "/robots/Robot1/pause")
+    for path, kinds in (
+        ("/events?kind=task", {"task"}),
+        ("/history?kind=robot,zone", {"robot"}),
+        ("/events?robot=Robot1", {"robot"}),
+        ("/events?kind=task&robot=Robot1", set()),
+    ):
+        found = (await client.ask("GET", path))[1]["events"]
+        assert {event["kind"] for event in found} == kinds, path
+    status, said, _ = await client.ask("GET", "/history?kind=tasks")
+    assert (status, "unknown kind 'tasks'; possible are task, robot" in said["error"]) == (422, True)
+
+
+async def test_robots_are_listed_by_state_and_activity(client: ManagerClient) -> None:
+    states = {"Robot1": "idle", "Robot2": "silent", "Robot3": "idle", "Robot4": "driving"}
+    for name, state in states.items():
+        client.manager.facts.robots[name] = RobotFacts(name, state, cell=3)
+
+    async def listed(query: str) -> tuple[list[str], str | None]:
+        found = (await client.ask("GET", f"/robots?{query}"))[1]
+        return [robot["id"] for robot in found["robots"]], found["next"]
+
+    assert await listed("") == (list(states), None)
+    assert await listed("state=idle,silent&limit=2") == (["Robot1", "Robot2"], "Robot2")
+    assert await listed("state=idle,silent&limit=2&cursor=Robot2") == (["Robot3"], None)
+    assert await listed("limit=4") == (list(states), None)
+    assert (await client.ask("POST", "/robots/Robot3/take-out"))[0] == 200
+    assert await listed("activity=out") == (["Robot3"], None)
+    assert (await client.ask("GET", "/robots/Robot3/manager"))[1]["activity"] == "out"
+
+
 async def test_an_old_etag_is_refused(client: ManagerClient) -> None:
     _, _, revision = await client.ask("POST", "/tasks", GO)
     status, body, newer = await client.ask("PATCH", "/tasks/T1", {"priority": 3}, revision=revision)
