@@ -1,5 +1,6 @@
 // What an operator can do by one click, each with its undo; where there is none, most ask first.
 
+import { isLight } from "./conditions.js";
 import { isCertain } from "./question.js";
 import { ask } from "./requests.js";
 import { t } from "./texts.js";
@@ -160,6 +161,7 @@ export class Actions {
 
   // Undo sets the pose that the robot would have without it, also if it has driven since.
   setPose(id, x, y, yaw) {
+    if (isLight(this.fleet, id)) return this.operator.say(t("action.localize.light", { robot: id }), true);
     const before = this.fleet.robots.get(id)?.pose;
     const old = before && { ...before };
     const undo = () => {

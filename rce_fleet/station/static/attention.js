@@ -155,7 +155,7 @@ export class Attention {
     const item = this.#line([name, " ", why], conditions[0].severity > 2);
     if (this.steers) {
       const row = element("div", "", "answers");
-      const names = [...new Set(conditions.flatMap(({ kind }) => ANSWERS[kind] ?? []))].filter((name) => isPossible(name, this.fleet));
+      const names = [...new Set(conditions.flatMap(({ kind }) => ANSWERS[kind] ?? []))].filter((name) => isPossible(name, this.fleet, robot.id));
       for (const answer of names) {
         const button = element("button", t(`action.${answer}`));
         button.type = "button";

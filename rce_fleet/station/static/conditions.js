@@ -14,9 +14,13 @@ export const TROUBLE = new Set(["unreachable", "silent", "lost", "dead"]);
 // Answers that the fleet manager gives; without one they are not offered.
 const NEEDS_MANAGER = new Set(["pause", "resume", "takeOut", "putIn", "charge", "reassign", "raise"]);
 
-export function isPossible(answer, fleet) {
+export function isPossible(answer, fleet, id) {
+  if (answer === "localize" && isLight(fleet, id)) return false;
   return fleet.manager || !NEEDS_MANAGER.has(answer);
 }
+
+// Whether it is a light robot of the simulated world: it always knows where it is, and cannot be told.
+export const isLight = (fleet, id) => fleet.things[id]?.[0] === "light";
 
 const OUT_MODES = new Set(["out_of_service", "dead"]);
 

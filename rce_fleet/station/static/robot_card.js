@@ -24,7 +24,7 @@ export class RobotCard {
     const paused = ["paused", "stopped"].includes(robot.ownMode); // a robot of a paused fleet is not, and cannot be resumed
     const out = isOut(robot);
     const stops = [...(robot.emergency && !robot.undelivered ? [] : ["stop"]), ...(robot.emergency ? ["release"] : [])];
-    const names = [...stops, paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));
+    const names = [...stops, paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet, robot.id));
     const key = [robot.id, ...names].join();
     if (key !== this.key) {
       this.key = key;

@@ -6,6 +6,8 @@ import pytest
 from integration.station.test_page_operator import site
 from unit.station.test_station_view import changes, robot
 
+from rce_fleet.station.world_link import things_text
+
 pytestmark = pytest.mark.needs("chromium")
 
 
@@ -39,3 +41,18 @@ async def test_all_that_needs_attention_can_be_shown() -> None:
         await page.wait_for_function("document.querySelectorAll('#attention-list li').length === 30")
         await page.locator("#attention-list li", has_text="Robot30").wait_for()
         assert await more.count() == 0
+
+
+async def test_a_light_robot_is_not_localized() -> None:
+    """It has no topic for it: the request was offered, and refused."""
+    async with site() as made:
+        page = await made.open()
+        made.feed.pages.send("things", things_text({"paused": False, "things": {"Robot1": ["light"]}}))
+        await page.wait_for_function("rceFleet.fleet.things.Robot1")
+        localize = page.locator("#robot-card button", has_text="Localize")
+        await page.locator("tr[data-robot=Robot2]").click()
+        await localize.wait_for()
+        await page.locator("tr[data-robot=Robot1]").click()
+        await localize.wait_for(state="detached")
+        await page.evaluate("void rceFleet.actions.setPose('Robot1', 1, 1, 0)")
+        await page.locator("text=it always knows where it is").first.wait_for()
