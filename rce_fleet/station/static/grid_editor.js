@@ -1,5 +1,6 @@
 // Another grid of cells: its numbers, its picture over the map, and taking it over.
 
+import { isCertain } from "./question.js";
 import { t } from "./texts.js";
 
 const WAIT_MS = 300; // after the last key, before the planner is asked
@@ -78,7 +79,7 @@ export class GridEditor extends EventTarget {
 
   async #takeOver() {
     const request = this.#request();
-    if (!request) return;
+    if (!request || !(await isCertain("grid"))) return;
     this.take.disabled = true;
     try {
       const answer = await this.ask("PUT", "/api/v1/grid", request);

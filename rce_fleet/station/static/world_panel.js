@@ -1,6 +1,7 @@
 // The view in three dimensions and what can be done in a simulated world: put in, move, take out, pause, reset.
 
 import { element } from "./engine.js";
+import { isCertain } from "./question.js";
 import { ask } from "./requests.js";
 import { t } from "./texts.js";
 
@@ -9,6 +10,7 @@ const TURN = 0.008;    // radians for a pixel
 const PICKS = ["add_box", "add_person", "add_robot", "remove"];
 const STEMS = { add_box: "box", add_person: "person", add_robot: "Robot" };
 const DRAG_PX = 4;     // a pointer that moves less clicks
+const ASKED = ["reset", "remove"]; // what undo does not take back
 const WALK_M = 0.5;    // a drag that is shorter puts a person who stands
 
 export class WorldPanel {
@@ -73,7 +75,9 @@ export class WorldPanel {
   }
 
   // before: what is moved, where it was: [name, x, y, yaw].
-  #act(request, before = null) {
+  async #act(request, before = null) {
+    const { action, name } = request;
+    if (ASKED.includes(action) && !(await isCertain(action, { name }))) return null;
     return this.operator.act(t("simulation"), () => ask("POST", "/simulation", request), this.#undo(request, before));
   }
 

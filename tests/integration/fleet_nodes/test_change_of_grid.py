@@ -206,6 +206,7 @@ async def test_the_grid_is_changed_on_the_page() -> None:
             )
             assert await page.evaluate("rceFleet.fleet.map.cell_size") == 1
             await page.click("#grid-take")
+            await page.click("#question-yes")  # goals are removed
             await page.wait_for_function(
                 "rceFleet.fleet.map.cell_size === 0.8 && rceFleet.editor.proposed === null"
             )
