@@ -29,6 +29,8 @@ MAX_CONNECTIONS = 4096
 """Open connections; for one more, that which was not used for the longest time is closed."""
 REQUEST_TIMEOUT = 30.0
 """Seconds from a request's first byte to its last."""
+_OF_BROWSERS = frozenset([b"origin", b"sec-fetch-site"])
+"""Browsers send one of these with each POST, clients of ROS none: without it, any page could call a node."""
 
 
 class RpcServer:
@@ -158,6 +160,8 @@ class _Connection(asyncio.Protocol):
         if isinstance(event, h11.Request):
             if event.method != b"POST":
                 self._refuse(405, "XML-RPC comes by POST")
+            elif any(name in _OF_BROWSERS for name, _ in event.headers):
+                self._refuse(403, "web pages may not use a ROS master or node")
         elif isinstance(event, h11.Data):
             self._size += len(event.data)
             if self._size > MAX_BODY:
