@@ -41,6 +41,12 @@ def _address(authority: str, default_port: str) -> tuple[str, str] | None:
     return (found["v6"] or found["name"]).lower(), found["port"] or default_port
 
 
+def host_of(authority: str) -> str:
+    """Return the host of a ``Host`` header, in lower case; empty if it has none."""
+    found = _HOST.fullmatch(authority)
+    return "" if found is None else (found["v6"] or found["name"]).lower().rstrip(".")
+
+
 class ServerNames:
     """The names by which a server may be asked for.
 

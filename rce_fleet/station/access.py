@@ -10,6 +10,7 @@ from typing import Any
 from aiohttp import hdrs, web
 
 from rce.aio.tasks import cancel_and_wait
+from rce.web.local import why_not_local
 from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
 from rce.web.routes import Route, parameter_fault
@@ -116,6 +117,8 @@ class AccessControl:
 
     def _refuse(self, request: web.Request, user: StationUser) -> web.Response | None:
         """Return why a user may not make a request, whatever it asks for; None if they may."""
+        if user.is_anonymous and (reason := why_not_local(request)) is not None:
+            return self._unauthorized(request, "", f"a request without a login is refused here: {reason}; ")
         if not user.may_view:
             return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
         seconds = 0 if _is_stop(request) else self.quotas.request(user)
@@ -159,13 +162,16 @@ class AccessControl:
         finally:
             await cancel_and_wait(asking)
 
-    def _unauthorized(self, request: web.Request, token: str) -> web.StreamResponse:
+    def _unauthorized(self, request: web.Request, token: str, reason: str = "") -> web.Response:
         if request.path == "/" and self._authenticator.has_logins:
             return web.Response(status=303, headers={hdrs.LOCATION: "/login"})
         if self._authenticator.has_logins:
             text = "log in at /login, or send a token (rce token) as 'Authorization: Bearer TOKEN'"
+        elif reason:
+            text = "start the station with --token"
         else:
             text = "send the station's token: as 'Authorization: Bearer TOKEN', or once as ?token=TOKEN"
+        text = reason + text
         if token:
             text = f"the token is not valid here (it may have ended, or be of another engine): {text}"
         return problem(401, text, {hdrs.WWW_AUTHENTICATE: "Bearer"})

@@ -34,11 +34,13 @@ class StationUser:
         name: Name of the engine's user.
         role: The user's role at the engine.
         is_owner: Whether the fleet belongs to this user.
+        is_anonymous: Whether it stands for requests without a token, which only this machine's user may send.
     """
 
     name: str
     role: str
     is_owner: bool = False
+    is_anonymous: bool = False
 
     @property
     def may_view(self) -> bool:
@@ -75,7 +77,7 @@ class Authenticator(Protocol):
 
     @property
     def has_logins(self) -> bool:
-        """Whether users log in at the page by name and password."""
+        """Whether users can log in at the page by name and password."""
 
     async def authenticate(self, token: str) -> StationUser | None:
         """Return the user of a token, or None if the token is not valid.
@@ -105,7 +107,7 @@ class TokenAuthenticator:
     """One token for all users, or none: for a fleet without an engine, which has no user accounts.
 
     Args:
-        token: The token that requests must carry; empty to accept every request.
+        token: The token that requests must carry; empty to accept every request of this machine's user.
     """
 
     has_logins = False
@@ -115,7 +117,9 @@ class TokenAuthenticator:
 
     async def authenticate(self, token: str) -> StationUser | None:
         """Return the user ``operator`` if the token is right."""
-        right = not self._token or hmac.compare_digest(token.encode(errors="surrogateescape"), self._token)
+        if not self._token:
+            return StationUser("operator", "operator", is_anonymous=True)
+        right = hmac.compare_digest(token.encode(errors="surrogateescape"), self._token)
         return StationUser("operator", "operator") if right else None
 
     def last_known(self, token: str) -> StationUser | None:

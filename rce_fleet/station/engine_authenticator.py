@@ -82,8 +82,11 @@ class EngineAuthenticator:
 
     Args:
         account: Account of the station; the fleet belongs to this user.
-        allow_anonymous: Treat requests without a token as the station's own user: for use on one machine.
+        allow_anonymous: Treat requests without a token as the station's own user, if they are of this
+            machine's user.
     """
+
+    has_logins = True
 
     def __init__(self, account: StationAccount, *, allow_anonymous: bool = False) -> None:
         self._account = account
@@ -98,11 +101,6 @@ class EngineAuthenticator:
     @property
     def _api(self) -> URL:
         return URL(self._masters.current) / "api/v1"
-
-    @property
-    def has_logins(self) -> bool:
-        """Whether users log in at the page by name and password."""
-        return not self._allow_anonymous
 
     async def __aenter__(self) -> Self:
         """Open the HTTP session; the master may start later."""
@@ -130,9 +128,9 @@ class EngineAuthenticator:
             AuthenticationError: The master cannot be reached.
         """
         if not token:
-            return (
-                StationUser(self._account.user, "operator", is_owner=True) if self._allow_anonymous else None
-            )
+            if not self._allow_anonymous:
+                return None
+            return StationUser(self._account.user, "operator", is_owner=True, is_anonymous=True)
         now = time.monotonic()
         known = self._cache.known(token, now - CACHE_S)
         if known is not None or self._cache.is_refused(token, now - CACHE_S):

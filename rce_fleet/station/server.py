@@ -234,7 +234,7 @@ class Station:
                 name=user.name,
                 role=user.role,
                 steers=user.may_control,
-                logged_in=self._authenticator.has_logins,
+                logged_in=self._authenticator.has_logins and not user.is_anonymous,
             )
         )
 

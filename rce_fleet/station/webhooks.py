@@ -88,7 +88,7 @@ class Webhooks:
 
     def _refusal(self, request: web.Request, action: str) -> web.Response | None:
         user = request[USER]
-        if user.may_control and (user.role == "admin" or not self._has_roles):
+        if user.may_control and (user.role == "admin" or user.is_anonymous or not self._has_roles):
             return None
         self._access.audit(request, action, "webhooks", done=False)
         return problem(403, f"user {user.name!r} has the role {user.role}; webhooks are for administrators")
