@@ -31,7 +31,7 @@ from rce.control import (
 )
 from rce.model import FaultCode
 from rce_master import requests
-from rce_master.audit import AuditLog, describe
+from rce_master.audit import DONE, REFUSED, AuditLog, describe
 from rce_master.exceptions import (
     FencedError,
     ForbiddenError,
@@ -312,8 +312,6 @@ class ControlHandler:
         wanted, faults = requests.read(user, request)
         parts = [wanted[first : first + MAX_TOGETHER] for first in range(0, len(wanted), MAX_TOGETHER)]
         outcomes = [await self._state_service.enqueue(part) for part in parts]
-        if self._audit is not None and wanted:
-            self._audit.add(user, f"request_{request.type.lower()}", detail=describe(wanted), via=request.id)
         await self._spawn(self._answer(peer, request, wanted, outcomes, faults))
 
     async def _answer(
@@ -325,17 +323,26 @@ class ControlHandler:
         faults: list[str],
     ) -> None:
         found = [error for part in outcomes for error in await part]
-        refused = [
-            (one, error)
-            for one, error in zip(wanted, found, strict=True)
-            if error is not None and not (request.repeated and _was_removed(one, error))
-        ]
+        done: list[commands.Request] = []
+        refused: list[tuple[commands.Request, MasterError]] = []
+        for one, error in zip(wanted, found, strict=True):
+            if error is None or (request.repeated and _was_removed(one, error)):
+                done.append(one)
+            else:
+                refused.append((one, error))
+        self._record(request, done, DONE)
+        self._record(request, [one for one, _ in refused], REFUSED)
         reply = ClientReply(
             request=request.request,
             errors=(*faults, *(f"{request.type}: {error}" for _, error in refused)),
             faults=(*(RequestFault() for _ in faults), *(_fault_of(one, error) for one, error in refused)),
         )
         peer.send(reply)
+
+    def _record(self, request: ClientRequest, parts: list[commands.Request], outcome: str) -> None:
+        if self._audit is not None and parts:
+            user, action = request.id.partition("/")[0], f"request_{request.type.lower()}"
+            self._audit.add(user, action, detail=describe(parts), via=request.id, outcome=outcome)
 
 
 def _was_removed(command: commands.Request, error: MasterError) -> bool:

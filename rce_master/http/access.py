@@ -41,6 +41,14 @@ def bearer(request: web.Request, services: Services, *, stations: bool = False) 
     return token, user
 
 
+def owner_of_token(request: web.Request, services: Services) -> str:
+    """Return the user of a request's token, whatever the token is good for; empty if it is not valid."""
+    try:
+        return services.tokens.find(_token(request))[0].name
+    except WrongCredentialsError:
+        return ""
+
+
 def admit(route: Route, user: User | None) -> None:
     """Check that a user may use a route.
 

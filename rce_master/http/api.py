@@ -95,11 +95,12 @@ class Api:
 
 def _adapt(route: Route, services: Services) -> Answer:
     async def answer(request: web.Request, parts: Mapping[str, str]) -> web.StreamResponse:
-        token, user = bearer(request, services, stations=route.stations)
-        if user is not None:
-            services.quotas.request(user)
-        call = Call(request, services, user, token, None, parts)
+        call = Call(request, services, None, "", None, parts)
         try:
+            token, user = bearer(request, services, stations=route.stations)
+            if user is not None:
+                services.quotas.request(user)
+            call = replace(call, user=user, token=token)
             admit(route, user)
             _check_parameters(route, request)
             text = b""

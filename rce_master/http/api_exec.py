@@ -13,10 +13,13 @@ from websockets.exceptions import ConnectionClosed
 from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_COMMAND, NOT_RUN, Command, ended_frame, read_command
 from rce.web.writing import write_in_time
+from rce_master.audit import DONE, REFUSED
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http.routes import OF_USER, Call, route_table
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from websockets.asyncio.server import ServerConnection
 
 
@@ -26,6 +29,7 @@ FIRST_MESSAGE_S = 10.0
 HEARTBEAT_S = 15.0
 CHECK_S = 60.0
 """Interval of checks whether the login has ended."""
+_LOGIN_ENDED = "your login has ended"
 
 
 @routes.route(
@@ -40,18 +44,14 @@ CHECK_S = 60.0
 async def execute(call: Call) -> web.StreamResponse:
     """Run a command."""
     id_ = f"{call.controlled_owner}/{call.path('container')}"
-    peer = call.services.reconciler.task_set_of(id_)
+    call.services.reconciler.task_set_of(id_)
     user = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, max_msg_size=MAX_COMMAND + 1)
     if not user.can_prepare(call.request):
         raise InvalidRequestError("this path is for WebSockets; 'rce exec' uses it")
     await user.prepare(call.request)
     try:
         command = await _first(user)
-        program = command.argv[0] if command.argv else "a shell"  # arguments may hold secrets
-        call.services.audit.add(
-            call.caller.name, "execute", id_, detail=f"program {program}", address=call.address
-        )
-        async with call.services.executions.open(peer, id_, command) as machine:
+        async with _opened(call, id_, command) as machine:
             await _relay(call, user, machine)
     except (MasterError, ValueError, TimeoutError) as error:
         text = str(error) or f"no command came within {FIRST_MESSAGE_S:g} s"
@@ -59,6 +59,43 @@ async def execute(call: Call) -> web.StreamResponse:
             await write_in_time(call.request, user.send_bytes(ended_frame(NOT_RUN, text).encode()))
     await user.close()
     return user
+
+
+@contextlib.asynccontextmanager
+async def _opened(call: Call, id_: str, command: Command) -> AsyncIterator[ServerConnection]:
+    """Have the container's machine run the command, and record in the audit log whether it does.
+
+    Raises:
+        ValueError: The login has ended since the request began.
+        MasterError: The command does not run.
+    """
+    program = command.argv[0] if command.argv else "a shell"  # arguments may hold secrets
+
+    def record(outcome: str, detail: str = "") -> None:
+        call.services.audit.add(
+            *(call.caller.name, "execute", id_),
+            detail=f"program {program}{detail}",
+            address=call.address,
+            outcome=outcome,
+        )
+
+    is_open = False
+    try:
+        _check_login(call)
+        peer = call.services.reconciler.task_set_of(id_)  # the container may have moved since
+        async with call.services.executions.open(peer, id_, command) as machine:
+            is_open = True
+            record(DONE)
+            yield machine
+    except (MasterError, ValueError) as error:
+        if not is_open:
+            record(REFUSED, f": {error}")
+        raise
+
+
+def _check_login(call: Call) -> None:
+    if not call.is_still_valid:
+        raise ValueError(_LOGIN_ENDED)
 
 
 async def _first(user: web.WebSocketResponse) -> Command:
@@ -117,4 +154,4 @@ async def _watch(call: Call) -> None:
     """
     while await call.lasts(CHECK_S):
         pass
-    raise ValueError("your login has ended")
+    raise ValueError(_LOGIN_ENDED)

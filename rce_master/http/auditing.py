@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import AuthError, ForbiddenError, MasterError
+from rce_master.http.access import owner_of_token
 
 if TYPE_CHECKING:
-    from rce_master.http.routes import Call, Route
+    from aiohttp import web
+
+    from rce_master.http.routes import Call, Route, Services
 
 _NAMES = ("userID", "tag", "tag_a", "tag_b", "name", "robot", "role", "scope", "draining")
 """Keys of bodies that name objects; all others are left out, because they may hold secrets."""
@@ -25,10 +28,23 @@ def note_done(route: Route, call: Call) -> None:
 def note_refused(route: Route, call: Call, error: MasterError) -> None:
     """Record a request that was refused because of its user. Invalid requests are not recorded."""
     if isinstance(error, AuthError | ForbiddenError) and _is_noted(route):
-        user = call.user.name if call.user is not None else _claimed(call)
+        user = (
+            call.user.name
+            if call.user is not None
+            else owner_of_token(call.request, call.services) or _claimed(call)
+        )
         what = type(error).__name__.removesuffix("Error")
         detail = f"{what} {route.method} {_subject(call)}".rstrip()
         call.services.audit.refuse(user, _action(route), detail=detail, address=call.address)
+
+
+def note_refused_scrape(request: web.Request, services: Services, error: MasterError) -> None:
+    """Record a request for the metrics that was refused because of its token."""
+    from rce_master.http.routes import Call  # takes memory, which most masters need not spend
+
+    address = Call(request, services, None, "", None, {}).address
+    detail = type(error).__name__.removesuffix("Error")
+    services.audit.refuse(owner_of_token(request, services), "get_metrics", detail=detail, address=address)
 
 
 def _is_noted(route: Route) -> bool:

@@ -15,6 +15,7 @@ from rce_master.exceptions import (
     AuthError,
     EndedError,
     FencedError,
+    ForbiddenError,
     MasterError,
     RefusedError,
     StoreError,
@@ -25,6 +26,7 @@ from rce_master.exceptions import (
     UnderWayError,
 )
 from rce_master.http.access import check_metrics
+from rce_master.http.auditing import note_refused_scrape
 from rce_master.http.health import HEALTH_PATH, Health
 from rce_master.http.late import LateApi
 from rce_master.http.origin_guard import origin_guard
@@ -90,7 +92,11 @@ def _metrics(services: Services) -> Handler:
         return make_answer(tables, services.reconciler.book, lambda: checks.checks, services.fence)
 
     async def handle(request: web.Request) -> web.Response:
-        check_metrics(request, services)
+        try:
+            check_metrics(request, services)
+        except (AuthError, ForbiddenError) as error:
+            note_refused_scrape(request, services, error)
+            raise
         return await scraped()()
 
     return handle

@@ -5,6 +5,11 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import pytest
+
+from rce.control import Execute
+from rce.control.execution import FEATURE
+from rce.control.messages import TaskSetKind
 from rce_master.auth import client_digest
 
 if TYPE_CHECKING:
@@ -111,3 +116,68 @@ async def test_viewer_notes_nothing_as_done(site: Site) -> None:
     refused = {"action": "set_goal", "outcome": "refused"}
     await site.api("POST", "/audit", refused, token=tokens["viewer"], status=204)
     await site.api("POST", "/audit", {"action": "Set goal"}, token=tokens["operator"], status=422)
+
+
+async def test_audit_has_refused_tokens(site: Site) -> None:
+    """A token that was guessed, revoked, or made for something else."""
+    tokens = await make_users(site)
+    robot = await site.api("POST", "/robot-tokens", {"robot": "R1"}, token=tokens["user"], status=201)
+    await site.api("GET", "/containers", token="rce_guess", status=401)
+    await site.api("POST", "/containers", {"tag": "c"}, token=robot["token"], status=403)
+    for token, status in (("rce_guess", 401), (robot["token"], 403)):
+        headers = {"Authorization": f"Bearer {token}"}
+        async with site.session.get(f"{site.url}metrics", headers=headers) as reply:
+            assert reply.status == status
+    records = (await site.api("GET", "/audit", since=-1000))["records"]
+    told = [(r["user"], r["action"]) for r in records if r["outcome"] == "refused"]
+    assert told == [
+        ("", "list_containers"), ("user", "create_container"), ("", "get_metrics"), ("user", "get_metrics")
+    ]  # fmt: skip
+
+
+async def test_audit_has_refused_robot_request(site: Site) -> None:
+    async with site.robots() as robots:
+        assert (await robots.channel.login("testUser", "R1", client_digest("testUser"))).status == 200
+        await robots.channel.client_request("testUser/R1", "CC", {"containerTag": "c"})
+        await robots.channel.client_request("testUser/R1", "DC", {"containerTag": "d"})
+        two = {"removeNodes": [{"containerTag": tag, "nodeTag": "n"} for tag in ("c", "d")]}
+        await robots.channel.client_request("testUser/R1", "CN", two)
+    records = (await site.api("GET", "/audit", since=-1000))["records"]
+    told = [(r["action"], r["outcome"], r["via"]) for r in records if r["action"].startswith("request_")]
+    assert told == [
+        ("request_cc", "done", "testUser/R1"),
+        ("request_dc", "refused", "testUser/R1"),
+        ("request_cn", "refused", "testUser/R1"),
+    ]
+
+
+async def run_command(site: Site, token: str, end_login: bool) -> bytes:
+    """Send a command late on the WebSocket of a run; return the frame that ends it."""
+    url, headers = f"{site.url}api/v1/containers/c/exec", {"Authorization": f"Bearer {token}"}
+    async with site.session.ws_connect(url, params={"user": "testUser"}, headers=headers) as socket:
+        if end_login:
+            await site.api("PUT", "/users/admin/role", {"role": "user"}, status=204)
+        await socket.send_str('{"argv": ["touch", "hunter22"]}')
+        return await socket.receive_bytes()
+
+
+async def test_audit_has_only_commands_that_ran(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_master.executions.DIAL_S", 0.1)
+    tokens = await make_users(site)
+    async with site.task_set(TaskSetKind.CONTAINER, "c1", features=(FEATURE,)) as containers:
+        await site.api("POST", "/containers", {"tag": "c"}, status=204)
+        assert b"does not answer" in await run_command(site, tokens["admin"], end_login=False)
+        await containers.get(Execute)
+        assert b"login has ended" in await run_command(site, tokens["admin"], end_login=True)
+        assert b"does not answer" in await run_command(site, site.token, end_login=False)
+        assert [type(one) for one in containers.taken].count(Execute) == 1
+        await containers.get(Execute)
+        assert containers.inbox.empty(), "the machine never gets the command of a login that has ended"
+    records = (await site.api("GET", "/audit", since=-1000))["records"]
+    told = [(r["user"], r["outcome"], r["detail"]) for r in records if r["action"] == "execute"]
+    away = "program touch: the machine of container 'c' does not answer"
+    assert told == [
+        ("admin", "refused", away),
+        ("admin", "refused", "program touch: your login has ended"),
+        ("testUser", "refused", away),
+    ]
