@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from aiohttp import hdrs, web
 
 from rce.aio.tasks import cancel_and_wait
+from rce.web.bodies import read_whole
 from rce.web.local import why_not_local
 from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
@@ -26,6 +28,8 @@ EMERGENCY_STOP = "/emergency-stop"
 """The end of paths of emergency stops."""
 STOP_CHECK_S = 0.3
 """How long an emergency stop waits for the check of its token."""
+SLOW_BODY_S = 1.0
+"""After a body that takes so long, the user is checked again."""
 _STOPS = re.compile(rf"{PREFIX}(/robots/[^/]+)?{EMERGENCY_STOP}")
 _PUBLIC = ("/login", f"{PREFIX}/login", f"{PREFIX}/openapi.json")
 """Paths that need no token, beside the static files of the pages."""
@@ -89,6 +93,37 @@ class AccessControl:
         except AuthenticationError:
             return True
         return user is not None and user.may_view and (user.may_control or not to_control)
+
+    async def read_body(self, request: web.Request) -> bytes:
+        """Read an accepted request's body, and check the user again if it came slowly.
+
+        Raises:
+            HTTPException: The body is damaged, too large, or did not come in good time.
+            AuthenticationError: The user's permission has ended meanwhile.
+        """
+        began = time.monotonic()
+        body = await read_whole(request)
+        await self.check_after(request, began)
+        return body
+
+    async def check_after(self, request: web.Request, began: float) -> None:
+        """Check the user of an accepted request again, if its body came slowly.
+
+        Args:
+            request: The request.
+            began: When the body was begun to be read, as told by ``time.monotonic``.
+
+        Raises:
+            AuthenticationError: The user's permission has ended or changed.
+        """
+        if time.monotonic() - began < SLOW_BODY_S:
+            return
+        try:
+            user = await self._authenticator.authenticate(request[TOKEN])
+        except AuthenticationError:
+            return  # it cannot be checked now
+        if user != request[USER]:
+            raise AuthenticationError(401, "your login has ended, or your role has changed; log in again")
 
     def control_refusal(self, request: web.Request, name: str, subject: str) -> web.Response | None:
         """Return None if the request's user may control the fleet; else record the refusal and return it."""

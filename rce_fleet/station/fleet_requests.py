@@ -6,6 +6,7 @@ status, body and revision are passed back as they are.
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
@@ -67,18 +68,20 @@ def role_of(user: StationUser) -> str:
     return "admin" if user.role == "admin" else "operator"
 
 
-async def read_body(request: web.Request) -> str:
-    """Read a body of JSON.
+async def read_body(request: web.Request, access: AccessControl) -> str:
+    """Read a body of JSON, and check the user again if it came slowly.
 
     Raises:
+        AuthenticationError: The user's permission has ended meanwhile.
         HTTPRequestEntityTooLarge: It is too large.
         HTTPBadRequest: It is not UTF-8, or damaged.
     """
-    body = bytearray()
+    body, began = bytearray(), time.monotonic()
     async for piece in read_pieces(request):
         body += piece
         if len(body) > MAX_BODY:
             raise web.HTTPRequestEntityTooLarge(MAX_BODY, len(body))
+    await access.check_after(request, began)
     try:
         return body.decode()
     except UnicodeDecodeError:
@@ -115,7 +118,7 @@ class FleetRequests:
             request.method,
             _target(request),
             user=request[USER],
-            body=await read_body(request) if action else "",
+            body=await read_body(request, self._access) if action else "",
             key=given[_KEY],
             revision=given[hdrs.IF_MATCH],
         )

@@ -282,7 +282,7 @@ class Station:
         refusal = self._access.control_refusal(request, "set_goal", robot)
         if refusal is not None:
             return refusal
-        asked = GoalRequest.model_validate_json(await read_whole(request))
+        asked = GoalRequest.model_validate_json(await self._access.read_body(request))
         message = await self.fleet_api.set_goal(robot, asked.cell, user=request[USER])
         self._access.audit(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
@@ -303,7 +303,7 @@ class Station:
         refusal = self._access.control_refusal(request, "block_cell", number)
         if refusal is not None:
             return refusal
-        asked = CellRequest.model_validate_json(await read_whole(request))
+        asked = CellRequest.model_validate_json(await self._access.read_body(request))
         user = request[USER]
         message = await self.fleet_api.block_cell(int(number), blocked=asked.blocked, user=user)
         self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
@@ -337,7 +337,7 @@ class Station:
         refusal = self._access.control_refusal(request, "set_grid", "grid")
         if refusal is not None:
             return refusal
-        asked = GridRequest.model_validate_json(await read_whole(request))
+        asked = GridRequest.model_validate_json(await self._access.read_body(request))
         choice = complete_grid(asked, self._view.map())
         answer = await self._fleet.set_grid(choice, preview=preview)
         made = grid_answer(choice, answer)

@@ -55,7 +55,7 @@ class Webhooks:
         """Add a webhook; it gets events from now on."""
         if (refusal := self._refusal(request, "add_webhook")) is not None:
             return refusal
-        asked = WebhookRequest.model_validate_json(await read_body(request))
+        asked = WebhookRequest.model_validate_json(await read_body(request, self._access))
         check_url(asked.url, allow_private=asked.allow_private)
         position = await self._feed.locate()
         made = self._store.add(asked, request[USER].name, position, self._feed.journal)

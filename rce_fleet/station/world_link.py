@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from rce.ros.closing import release
 from rce.ros.errors import RosError
 from rce.ros.node import Node
-from rce.web.bodies import read_whole
 from rce.web.routes import Route, RouteTable
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.station.access import AccessControl, problem
@@ -223,7 +222,7 @@ class WorldRoutes:
         refusal = self._access.control_refusal(request, "simulation", "world")
         if refusal is not None:
             return refusal
-        asked = WorldRequest.model_validate_json(await read_whole(request))
+        asked = WorldRequest.model_validate_json(await self._access.read_body(request))
         if self._world is None:
             return problem(404, "this station has no simulated world; start it with --world URI")
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -125,9 +126,12 @@ class ControlRoutes:
         refusal = self._access.control_refusal(request, "emergency_stop", subject)
         if refusal is not None:
             return refusal
+        began = time.monotonic()
         asked = StopRequest.model_validate_json(await read_whole(request))
         if not asked.stopped and not request[IS_CHECKED]:
             return problem(503, "robots are released when the engine can be reached to check the login")
+        if not asked.stopped:
+            await self._access.check_after(request, began)
         if self._control is None:
             return problem(409, "this station cannot reach robots")
         robots = None if robot is None else [robot]
@@ -156,7 +160,7 @@ class ControlRoutes:
         refusal = self._access.control_refusal(request, "set_pose", robot)
         if refusal is not None:
             return refusal
-        asked = PoseRequest.model_validate_json(await read_whole(request))
+        asked = PoseRequest.model_validate_json(await self._access.read_body(request))
         if self._control is None:
             return problem(409, "this station cannot reach robots")
         try:
@@ -179,7 +183,7 @@ class ControlRoutes:
         refusal = self._access.control_refusal(request, "set_mode", "fleet")
         if refusal is not None:
             return refusal
-        asked = ModeRequest.model_validate_json(await read_whole(request))
+        asked = ModeRequest.model_validate_json(await self._access.read_body(request))
         message = await self._fleet.set_mode(asked.mode, reason=asked.reason, user=request[USER])
         self._access.audit(request, "set_mode", "fleet", asked.mode)
         return _reply(Answer(message=message))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -9,13 +10,15 @@ from typing import Any
 
 import aiohttp
 import pytest
+from aiohttp import web
 from aiohttp.test_utils import TestServer
 from support.browser import CHROMIUM
 from support.engine import until
 from support.master_program import master
 from yarl import URL
 
-from rce_fleet.station import page_socket
+from rce.web.bodies import read_whole
+from rce_fleet.station import access, engine_authenticator, page_socket
 from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
@@ -232,3 +235,33 @@ async def test_page_asks_for_login(tmp_path: Path) -> None:
         finally:
             await browser.close()
     assert site.fleet.desired == []
+
+
+async def test_slow_body_of_ended_login_controls_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The user's role changes between the head of a request and the end of its body."""
+    monkeypatch.setattr(access, "SLOW_BODY_S", 0.0)
+    monkeypatch.setattr(engine_authenticator, "CACHE_S", 0.0)
+    is_reading = asyncio.Event()
+
+    async def read_noted(request: web.Request) -> bytes:
+        is_reading.set()
+        return await read_whole(request)
+
+    monkeypatch.setattr(access, "read_whole", read_noted)
+    async with running_site(tmp_path) as site:
+
+        async def late_body(change: str) -> AsyncIterator[bytes]:
+            yield b'{"cell": '
+            await is_reading.wait()
+            await site.master("PUT", "/users/operator/role", {"role": change}, status=204)
+            yield b"7}"
+
+        url = f"{site.station}api/v1/robots/Robot1/goal"
+        headers = {"Authorization": f"Bearer {site.tokens['operator']}"}
+        for change, status in (("operator", 200), ("viewer", 401)):
+            is_reading.clear()
+            async with site.session.put(url, data=late_body(change), headers=headers) as reply:
+                assert reply.status == status
+        assert site.fleet.desired == [("Robot1", 7)]
