@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import ssl
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
@@ -54,6 +55,7 @@ class TlsIdentity:
         self._bad: dict[str, _Signature] = {}
         self._serials: frozenset[int] = frozenset()
         self._serials_of: object = None
+        self._bad_serials: object = ()
 
     def server(self) -> ssl.SSLContext:
         """Return the context of a server that asks clients for no certificate.
@@ -88,15 +90,20 @@ class TlsIdentity:
         files = self.files
         stamp = None if files.revoked is None else _stamp(files.revoked)
         if stamp != self._serials_of and files.revoked is not None and files.authority is not None:
-            self._serials_of = stamp
-            from rce.tls.revocation import read_list
-
             try:
-                found = read_list(files.revoked.read_bytes(), files.authority.read_bytes()) if stamp else []
-                self._serials = frozenset(one.serial for one in found)
-            except (OSError, CertificateError) as error:
-                _log.warning("the former list of revoked certificates stays in use: %s", error)
+                self._serials = _revoked_serials(files.revoked, files.authority)
+                self._serials_of = stamp
+            except OSError as error:  # it is read again, by the next call
+                self._warn_of_serials(stamp, error)
+            except CertificateError as error:
+                self._serials_of = stamp
+                self._warn_of_serials(stamp, error)
         return serial in self._serials
+
+    def _warn_of_serials(self, stamp: object, error: Exception) -> None:
+        if self._bad_serials != stamp:
+            self._bad_serials = stamp
+            _log.warning("the former list of revoked certificates stays in use: %s", error)
 
     def _get(self, role: str, make: Callable[[], ssl.SSLContext]) -> ssl.SSLContext:
         now = self._signature()
@@ -150,6 +157,8 @@ class TlsIdentity:
         try:
             context.load_verify_locations(authority)
         except (OSError, ssl.SSLError) as error:
+            if isinstance(error, PermissionError):
+                raise CertificateError(f"the authority {authority} {_why_unreadable(authority)}") from error
             raise CertificateError(
                 f"cannot use the authority {authority}: {_reason(error)};"
                 " copy authority.pem from the engine's certificates folder"
@@ -158,12 +167,11 @@ class TlsIdentity:
 
     def _refuse_revoked(self, context: ssl.SSLContext, authority: Path) -> None:
         revoked = self.files.revoked
-        if revoked is None or not revoked.exists():
+        if revoked is None:
             return
-        from rce.tls.revocation import read_list  # takes 10 MB, which only engines with a list spend
-
         try:
-            read_list(revoked.read_bytes(), authority.read_bytes())
+            if not _revoked_serials(revoked, authority):
+                return
             context.load_verify_locations(revoked)
         except (OSError, CertificateError) as error:
             why = _reason(error) if isinstance(error, OSError) else error
@@ -177,14 +185,9 @@ class TlsIdentity:
         try:
             context.load_cert_chain(certificate, key, _no_password)
         except (OSError, ssl.SSLError) as error:
-            missing = next(
-                (file for file in (certificate, key) if file is not None and not file.exists()), None
-            )
-            if missing is not None:
-                raise CertificateError(
-                    f"{missing} does not exist;"
-                    " make it (rce certificate issue NAME) or copy it from the engine"
-                ) from error
+            for file in (certificate, key):
+                if file is not None and (why := _why_unreadable(file)):
+                    raise CertificateError(f"{file} {why}") from error
             raise CertificateError(f"cannot use the certificate {certificate}: {_reason(error)}") from error
 
 
@@ -224,6 +227,43 @@ def _stamp(file: Path | None) -> tuple[int, int, int] | None:
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _revoked_serials(revoked: Path, authority: Path) -> frozenset[int]:
+    """Read a list of revoked certificates, which may be missing.
+
+    Raises:
+        OSError: It cannot be read.
+        CertificateError: It is damaged, or the authority did not sign it.
+    """
+    try:
+        signed = revoked.read_bytes()
+    except FileNotFoundError:
+        return frozenset()
+    from rce.tls.revocation import read_list  # takes 10 MB, which only engines with a list spend
+
+    return frozenset(one.serial for one in read_list(signed, authority.read_bytes()))
+
+
+def _why_unreadable(file: Path) -> str:
+    """Return why a file cannot be read, and what to do; empty if it can be, or for another reason."""
+    try:
+        file.open("rb").close()
+    except FileNotFoundError:
+        folder = file.parent
+        return (
+            f"does not exist; make it (rce certificate issue NAME --certificates {folder})"
+            " or copy it from the engine"
+        )
+    except PermissionError:
+        user = os.geteuid()
+        return (
+            f"may not be read by this program's user ({user}): chown it and its folder to {user},"
+            " or start the program as their owner"
+        )
+    except OSError:
+        return ""
+    return ""
 
 
 def _reason(error: OSError) -> str:

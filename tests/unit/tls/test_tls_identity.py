@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 from pathlib import Path
 
 import pytest
+from support.other_user import OTHER_USER, as_user
 
+from rce.tls.authority import read_details
 from rce.tls.choice import WARNED_VARIABLE, TlsChoice, plain_warning
 from rce.tls.expiry import expiry_warning, name_warning
 from rce.tls.faults import CertificateError
@@ -62,6 +65,48 @@ def test_missing_file_is_named(folder: CertificateFolder) -> None:
         identity_of(folder).server()
     with pytest.raises(CertificateError, match="cannot use the authority"):
         TlsIdentity(TlsFiles(authority=folder.path / "nowhere.pem")).client()
+
+
+@pytest.mark.needs("root")
+def test_folder_of_another_user_is_named(folder: CertificateFolder, caplog: pytest.LogCaptureFixture) -> None:
+    """Its owner may be root, who issued the certificate, and the program a service of another user."""
+    serial = read_details(folder.certificate("cloud").read_bytes()).serial
+    folder.revoke("cloud")
+    folder.issue("cloud")
+    used = TlsIdentity(
+        TlsFiles(folder.certificate("cloud"), folder.key("cloud"), folder.authority, folder.revoked)
+    )
+    first = used.mutual_server()
+    assert used.is_revoked(serial)
+    with as_user(OTHER_USER), caplog.at_level(logging.WARNING):
+        for make in (identity_of(folder).server, TlsIdentity(TlsFiles(authority=folder.authority)).client):
+            with pytest.raises(CertificateError, match=f"may not be read .*chown it .* to {OTHER_USER}"):
+                make()
+        assert used.mutual_server() is first
+        assert used.is_revoked(serial)
+    (record, _) = caplog.records
+    assert "the former certificate stays in use" in record.getMessage()
+
+
+def test_list_of_revoked_that_was_not_read_is_read_again(
+    folder: CertificateFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """All files of the program may have been open, for example."""
+    identity = TlsIdentity(
+        TlsFiles(folder.certificate("cloud"), folder.key("cloud"), folder.authority, folder.revoked)
+    )
+    serial = read_details(folder.certificate("cloud").read_bytes()).serial
+    folder.revoke("cloud")
+    with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
+        patch.setattr(Path, "read_bytes", fail_to_open)
+        assert not identity.is_revoked(serial)
+        assert not identity.is_revoked(serial)
+    assert len(caplog.records) == 1
+    assert identity.is_revoked(serial)
+
+
+def fail_to_open(path: Path) -> bytes:
+    raise OSError(errno.EMFILE, "Too many open files", str(path))
 
 
 def test_encrypted_key_does_not_ask_at_the_terminal(folder: CertificateFolder) -> None:
