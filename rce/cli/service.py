@@ -11,6 +11,7 @@ import shutil
 import stat
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -97,6 +98,7 @@ def install(service: Service, *, start: bool = True) -> None:
         make_user(service.user)
         _open_state_folder(service)
         _open_secret(service)
+        _open_certificates(service)
     folder = _units(system=service.system)
     folder.mkdir(parents=True, exist_ok=True)
     path, text = folder / service.name, unit(service)
@@ -116,7 +118,8 @@ def install(service: Service, *, start: bool = True) -> None:
 
 def _open_state_folder(service: Service) -> None:
     """Let the service's user pass through the state folder, also if root's umask closed it."""
-    if service.state is None or not service.state.is_relative_to(SYSTEM_STATE):
+    paths = (service.state, *service.certificates)
+    if not any(path is not None and path.is_relative_to(SYSTEM_STATE) for path in paths):
         return
     SYSTEM_STATE.mkdir(parents=True, exist_ok=True)
     mode = stat.S_IMODE(SYSTEM_STATE.stat().st_mode)
@@ -131,6 +134,51 @@ def _open_secret(service: Service) -> None:
     _let_group(service.secret, service.user, stat.S_IROTH)
     if service.secret.parent == SYSTEM_CONFIG:
         _let_group(SYSTEM_CONFIG, service.user, stat.S_IXOTH)
+
+
+def _open_certificates(service: Service) -> None:
+    """Give the service's user its certificate, the key and the list of revoked ones, and their folder.
+
+    The authority's key stays root's.
+
+    Raises:
+        typer.Exit: The user still may not read them.
+    """
+    if not service.certificates:
+        return
+    folder, user = service.certificates[0].parent, service.user
+    for path in (folder, *service.certificates, folder / "revoked.pem"):
+        _give(path, user)
+    for path in service.certificates:
+        if not _allows(path.stat(), user, stat.S_IROTH) or _first_closed(path, user) is not None:
+            closed = _first_closed(path, user) or path
+            _fail(
+                f"user {user} may not read {path}: let it use {closed}, for example by chown {user} {closed}"
+            )
+
+
+def _give(path: Path, user: str) -> None:
+    """Give a file or folder of root to a user who may not use it."""
+    account = pwd.getpwnam(user)
+    # The folder may be this user's already: nothing that the user links to changes.
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return
+    try:
+        found = os.fstat(descriptor)
+        is_folder = stat.S_ISDIR(found.st_mode)
+        is_alone = is_folder or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1)
+        bit = stat.S_IXOTH if is_folder else stat.S_IROTH
+        if is_alone and found.st_uid == 0 and not _allows(found, user, bit):
+            os.fchown(descriptor, account.pw_uid, account.pw_gid)
+    finally:
+        os.close(descriptor)
+
+
+def _first_closed(path: Path, user: str) -> Path | None:
+    """Return the first folder on the way to a path, from its end, that a user may not enter."""
+    return next((each for each in path.parents if not _allows(each.stat(), user, stat.S_IXOTH)), None)
 
 
 def _let_group(path: Path, user: str, bit: int) -> None:
@@ -206,7 +254,8 @@ def make_service(
     }
     user = run_as if system and role in (Role.MASTER, Role.ROBOT) and run_as != "root" else ""
     secret = (settings.secret_file or SYSTEM_CONFIG / "secret") if system and not settings.dev else None
-    needed = (*_needed(program), *((secret,) if secret is not None else ()))
+    certificates = _certificates(settings, arguments) if system and role is not Role.ENGINE else ()
+    needed = (*_needed(program), *((secret,) if secret is not None else ()), *certificates)
     return Service(
         role=role,
         program=program,
@@ -215,8 +264,23 @@ def make_service(
         user=user,
         secret=secret,
         state=states.get(role),
+        certificates=certificates,
         hide_homes=not any(path.is_relative_to(home) for path in needed for home in HOMES),
     )
+
+
+def _certificates(settings: EngineSettings, arguments: tuple[str, ...]) -> tuple[Path, ...]:
+    """Return the files of TLS that a program reads by its settings and its arguments."""
+    if not settings.tls.enabled and "--tls" not in arguments:
+        return ()
+    folder, name = settings.certificates, settings.tls.name
+    words = [part for word in arguments for part in word.split("=", 1)]
+    for option, value in pairwise(words):
+        if option == "--certificates":
+            folder = Path(value).absolute()
+        elif option == "--certificate":
+            name = value
+    return folder / "authority.pem", folder / f"{name}.pem", folder / f"{name}.key"
 
 
 def _load(file: Path | None) -> EngineSettings:
@@ -264,6 +328,13 @@ def check(service: Service) -> None:
         )
     if service.secret is not None:
         _check_secret(service, service.secret, hidden=hidden)
+    missing = next((path for path in service.certificates if not path.exists()), None)
+    if missing is not None:
+        where = f"--certificates {missing.parent}"
+        _fail(
+            f"the unit uses TLS, and {missing} is missing: copy it from the machine with the authority, or"
+            f" make it there (rce certificate init {where}, rce certificate issue {missing.stem} {where})"
+        )
     if not service.system and not default_secret_file().exists():
         typer.echo(f"note: {default_secret_file()} has no secret yet; create one with: rce secret new")
 
@@ -281,10 +352,8 @@ def _check_secret(service: Service, secret: Path, *, hidden: bool) -> None:
         )
     # The folder of settings is opened when the service is installed.
     path = SYSTEM_CONFIG if secret.parent == SYSTEM_CONFIG else secret
-    closed = next(
-        (each for each in path.parents if not _allows(each.stat(), service.user, stat.S_IXOTH)), None
-    )
-    if service.user and closed is not None:
+    closed = _first_closed(path, service.user) if service.user else None
+    if closed is not None:
         _fail(
             f"user {service.user} may not enter {closed}, which the secret {secret} is in: move it to"
             f" {SYSTEM_CONFIG}, or give --run-as root"

@@ -37,6 +37,7 @@ class Service:
         user: The user that it runs as; empty for root, or the user whose unit it is.
         secret: File with the engine's secret; None: the program finds it itself.
         state: Folder that it may write; None for none.
+        certificates: Files of TLS that it reads, all in one folder; empty without TLS.
         hide_homes: Hide home folders: it needs nothing in them.
     """
 
@@ -47,6 +48,7 @@ class Service:
     user: str = ""
     secret: Path | None = None
     state: Path | None = None
+    certificates: tuple[Path, ...] = ()
     hide_homes: bool = True
 
     @property
