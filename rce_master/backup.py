@@ -18,10 +18,11 @@ import stat
 import tarfile
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeAlias
 
@@ -34,7 +35,7 @@ from rce_master.snapshots.service import SNAPSHOTS
 from rce_master.state.tables import Tables
 from rce_master.state.user_records import UserPackage
 from rce_master.store.base import SCHEMA_VERSION
-from rce_master.store.lock import FolderLock
+from rce_master.store.lock import UNFINISHED_RESTORE, FolderLock, check_restored
 from rce_master.store.sqlite import FILE_NAME
 
 FORMAT = 1
@@ -51,6 +52,8 @@ _LEFT_OUT = {*_STORE, "lock", ARCHIVES, SNAPSHOTS, "etcd"}
 same state folder."""
 _OF_ETCD = "etcd."
 """How the names of its other files begin: its configuration, and data that ``rce cluster recover`` keeps."""
+_OF_RESTORE = {"lock", UNFINISHED_RESTORE}
+"""Files that stay in a state folder: the lock is held, and by the other one masters refuse the folder."""
 _PIECE = 1 << 20
 
 
@@ -80,6 +83,7 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
         export: Gives an SQLite file with the contents of a store that is elsewhere.
 
     Raises:
+        StoreError: A restore to the folder did not finish.
         BackupError: The folder has no state, the state cannot be copied, or the file exists already or
             would be in a folder that is copied.
     """
@@ -89,6 +93,7 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
             f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}; "
             "name the folder with --state-dir or --config; for a state in etcd, add --store etcd://HOST:PORT"
         )
+    check_restored(folders[MASTER])
     if out.exists():
         raise BackupError(f"{out} is there already; name another file, or remove it")
     for folder in folders.values():
@@ -111,7 +116,8 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
 def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -> tuple[Copy, list[Path]]:
     """Restore a copy's state into folders.
 
-    The whole copy is read and checked before any file changes.
+    The whole copy is read and checked before any file changes. If it is interrupted later, masters refuse the
+    folder until it was repeated.
 
     Args:
         file: The copy.
@@ -128,6 +134,7 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
     """
     master = folders[MASTER]
     aside: list[Path] = []
+    marker = master / UNFINISHED_RESTORE
     with locked(master):
         there = [folder for folder in folders.values() if _holds_state(folder)]
         there = [folder for folder in there if not _is_inside(folder, master)]  # they are moved with it
@@ -137,7 +144,8 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
             with tempfile.TemporaryDirectory(dir=master.parent, prefix=".rce-restore-") as name:
                 found = extract(file, Path(name))
                 check_store(Path(name) / MASTER / FILE_NAME)
-                stamp = time.strftime("%Y%m%d-%H%M%S")
+                _write_marker(marker)
+                stamp = _free_stamp(folders.values())
                 for folder in there:
                     former = folder.with_name(f"{folder.name}.before-{stamp}")
                     former.mkdir(mode=0o700)
@@ -147,9 +155,14 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
                     _move(Path(name) / part, folder)
                     if part == CERTIFICATES:
                         _keep_owners(folder, folder.with_name(f"{folder.name}.before-{stamp}"))
+                for folder in folders.values():
+                    _sync_folder(folder)
+                marker.unlink()
+                _sync_folder(master)
         except (OSError, tarfile.TarError) as error:
             places = " and ".join(map(str, aside))
             hint = f"; the former state is in {places}: to use it again, move it back" if aside else ""
+            hint += f" and remove {marker}" if hint and marker.exists() else ""
             raise BackupError(f"cannot restore {file}: {error}{hint}") from error
     return found, aside
 
@@ -158,7 +171,7 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
 def locked(folder: Path) -> Iterator[None]:
     """Hold the lock on a state folder. After an error, remove the folders that were made for it."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
-    lock = FolderLock(folder)
+    lock = FolderLock(folder, restores=True)
     try:
         yield
     except BaseException:
@@ -372,16 +385,42 @@ def _write_file(path: Path, content: IO[bytes], mode: int) -> str:
 
 
 def _holds_state(folder: Path) -> bool:
-    return folder.is_dir() and any(path.name != "lock" for path in folder.iterdir())
+    return folder.is_dir() and any(path.name not in _OF_RESTORE for path in folder.iterdir())
+
+
+def _free_stamp(folders: Collection[Path]) -> str:
+    """Return the time, with a number if a former state was moved aside in the same second."""
+    now = time.strftime("%Y%m%d-%H%M%S")
+    stamps = chain([now], (f"{now}-{number}" for number in count(2)))
+    return next(
+        stamp
+        for stamp in stamps
+        if not any(folder.with_name(f"{folder.name}.before-{stamp}").exists() for folder in folders)
+    )
 
 
 def _is_inside(folder: Path, other: Path) -> bool:
     return other.resolve() in folder.resolve().parents
 
 
+def _write_marker(marker: Path) -> None:
+    marker.touch(mode=0o600)
+    _sync_folder(marker.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the names in a folder survive a power cut."""
+    if folder.is_dir():
+        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def _move_aside(folder: Path, aside: Path) -> None:
     for path in folder.iterdir():
-        if path.name != "lock":  # which is held
+        if path.name not in _OF_RESTORE:
             path.rename(aside / path.name)
 
 

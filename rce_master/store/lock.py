@@ -12,18 +12,36 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+UNFINISHED_RESTORE = "unfinished-restore"
+"""Name of the file that is in a state folder while a state is restored to it."""
+
+
+def check_restored(folder: Path) -> None:
+    """Check that a state folder does not hold a part of a state.
+
+    Raises:
+        StoreError: A restore was interrupted.
+    """
+    if (folder / UNFINISHED_RESTORE).exists():
+        raise StoreError(
+            f"a restore to {folder} did not finish: repeat it with the same backup file (rce restore FILE"
+            f" --replace); the state of before is in {folder}.before-DATE"
+        )
+
+
 class FolderLock:
     """Held while it is open; the kernel releases it when the process ends for any reason.
 
     Args:
         folder: Made if it is not there, readable by its owner only.
+        restores: Whether it is held to restore the folder's contents.
 
     Raises:
         StoreBusyError: Another process holds it.
-        StoreError: The folder cannot be used.
+        StoreError: The folder cannot be used, or holds a part of a state because a restore did not finish.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, restores: bool = False) -> None:
         self._path = folder / "lock"
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -38,6 +56,12 @@ class FolderLock:
             raise StoreBusyError(
                 f"a master is running on the state folder {folder}; stop it first"
             ) from error
+        if not restores:
+            try:
+                check_restored(folder)
+            except StoreError:
+                self.close()
+                raise
 
     def remove(self) -> None:
         """Remove its file, which is held until :meth:`close`."""

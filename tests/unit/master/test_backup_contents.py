@@ -9,6 +9,7 @@ import pytest
 
 from rce_master import backup
 from rce_master.backup import CERTIFICATES, MASTER, BackupError, back_up, restore
+from rce_master.exceptions import StoreError
 from rce_master.snapshots.service import SNAPSHOTS
 from rce_master.store.sqlite import FILE_NAME, SqliteStore
 
@@ -89,3 +90,26 @@ def test_a_restore_that_fails_tells_where_the_state_is(
     (aside,) = tmp_path.glob("state.before-*")
     assert f"{aside}: to use it again" in str(refusal.value)
     assert (aside / FILE_NAME).exists()
+
+
+@pytest.mark.parametrize("step", ["_move_aside", "_move", "_keep_owners"])
+async def test_folder_of_an_interrupted_restore_is_refused(
+    nested: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """Power is cut before a step: a master that starts then would make a new, empty state."""
+
+    def cut(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(backup, step, cut)
+        with pytest.raises(KeyboardInterrupt):
+            restore(tmp_path / "copy.tar", nested, replace=True)
+    with pytest.raises(StoreError, match=r"did not finish: repeat it .*rce restore FILE --replace"):
+        await SqliteStore.open(nested[MASTER])
+    if (nested[MASTER] / FILE_NAME).exists():
+        with pytest.raises(StoreError, match="did not finish"):
+            back_up(nested, tmp_path / "other.tar")
+    restore(tmp_path / "copy.tar", nested, replace=True)
+    await (await SqliteStore.open(nested[MASTER])).close()
+    assert (nested[CERTIFICATES] / "authority.key").read_text() == "the copied one"
