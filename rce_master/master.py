@@ -16,6 +16,7 @@ from rce.guard import TrustedProxies
 from rce.own_process import listening
 from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
+from rce.tls.names import CertificateNames
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer, LateApplication
 from rce_master.answers import PURPOSE as ANSWERS_PURPOSE
@@ -256,7 +257,7 @@ class Master:
         if settings.dev:
             await make_dev_user(services)
         for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
-        names = ServerNames(settings.bind, settings.names)
+        names = ServerNames(settings.bind, settings.names, CertificateNames(for_clients))
         entry = Entry(
             services.state_service.tables, asyncio.get_running_loop().time, services.reconciler.silence
         )

@@ -16,6 +16,7 @@ from rce.link.address import in_url, is_any, own_address
 from rce.own_process import listening
 from rce.tls.choice import is_loopback
 from rce.tls.expiry import watch_expiry
+from rce.tls.names import CertificateNames
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.audit import AUDIT
@@ -149,7 +150,7 @@ class ReplicatedMaster:
 
         settings = self._settings
         for_clients = settings.tls.for_clients()
-        names = ServerNames(settings.bind, settings.names)
+        names = ServerNames(settings.bind, settings.names, CertificateNames(for_clients))
         key = RequestKey(self._secret)
         check = LeaderCheck(key, keeper.newest_term)
         packages = ContentStore(settings.state_dir / ARCHIVES, noun="package")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 import socket
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 _HOST = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<name>[^:@\[\]\s/]+))(?::(?P<port>[0-9]{1,5}))?")
 _ORIGIN = re.compile(r"(?P<scheme>https?)://(?P<authority>[^/?#]+)", re.IGNORECASE)
@@ -64,9 +64,16 @@ class ServerNames:
     Args:
         bind: The address or name that the server listens on.
         public: Further names that its operator gave it.
+        certified: Returns the names in its certificate, in lower case.
     """
 
-    def __init__(self, bind: str = "", public: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        bind: str = "",
+        public: Iterable[str] = (),
+        certified: Callable[[], Collection[str]] = frozenset,
+    ) -> None:
+        self._certified = certified
         machine = socket.gethostname().lower()
         own = ("localhost", machine, machine.partition(".")[0], bind, *public)
         self._names = frozenset(name.lower().rstrip(".") for name in own if name)
@@ -80,7 +87,8 @@ class ServerNames:
         try:
             ipaddress.ip_address(text)
         except ValueError:
-            return found["v6"] is None and text.lower().rstrip(".") in self._names
+            name = text.lower().rstrip(".")
+            return found["v6"] is None and (name in self._names or name in self._certified())
         return True
 
     def refusal(self, host: str) -> str | None:

@@ -31,6 +31,7 @@ from rce.ros.types import TypeRegistry
 from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
 from rce.tls.faults import CertificateError
 from rce.tls.identity import Context, client_contexts
+from rce.tls.names import CertificateNames
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
@@ -139,7 +140,7 @@ def ui(
         _log.warning("%s", text)
     authenticator = _authenticator(backend, bind, token, login)
     try:
-        names = ServerNames(bind, public_name or ())
+        names = ServerNames(bind, public_name or (), CertificateNames(identity))
         server_tls = identity.server if identity else None
         place = state_dir or default_state_dir() / "station"
         uvloop.run(

@@ -21,6 +21,8 @@ from rce.tls.folder import CertificateFolder
 from rce_client import Connection
 from rce_client.exceptions import RefusedError
 
+NAMED = "named.example"
+
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("curl", "openssl")]
 
 
@@ -43,6 +45,23 @@ async def test_certificate_for_another_name_is_refused(world: World) -> None:
     )
     assert code == 60, text
     assert "elsewhere.example" in text
+
+
+@in_world
+async def test_name_in_the_certificate_is_served(world: World) -> None:
+    where = f"{NAMED}:{world.http}"
+    folder = world.certificates
+    folder.issue("engine", ("127.0.0.1", NAMED))
+    code, text = await world.curl(
+        *(
+            "--cacert",
+            world.authority,
+            "--resolve",
+            f"{where}:127.0.0.1",
+            f"https://{where}/api/v1/openapi.json",
+        )
+    )
+    assert (code, "openapi" in text) == (0, True), text
 
 
 @in_world
