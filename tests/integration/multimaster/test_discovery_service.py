@@ -9,6 +9,7 @@ import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
 
+import aiohttp
 import pytest
 from support.engine import Program
 from support.multimaster import STRING, DiscoveryNetwork, node
@@ -24,6 +25,7 @@ from rce.ros.multimaster.rpc import MAX_TYPES
 from rce.ros.node import ServiceClient
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.codec import encode_call
 
 
 def program(name: str, *arguments: str, folder: Path) -> Program:
@@ -43,6 +45,18 @@ async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) 
                             break
             assert discovery.info is not None
             assert discovery.info.nodes["/n"].is_local
+
+
+async def test_web_page_cannot_ask_a_discovery(network: DiscoveryNetwork) -> None:
+    async with (
+        Core(port=0) as core,
+        Discovery(network.settings(core.uri)) as discovery,
+        aiohttp.ClientSession() as browser,
+    ):
+        for headers, status in (({"Origin": "https://evil.example"}, 403), ({}, 200)):
+            call = encode_call("masterInfo", ())
+            async with browser.post(discovery.monitor_uri, data=call, headers=headers) as reply:
+                assert reply.status == status
 
 
 async def test_question_for_masters_leaves_no_client(network: DiscoveryNetwork) -> None:
