@@ -126,9 +126,10 @@ async def test_reads_the_fleet(running: RunningStation) -> None:
             "known are: cursor, deadline_before, limit, order, requester, robot, state",
         ),
         ("tasks?state=open&state=ended", "", "query parameter 'state' is given 2 times; give it once"),
-        ("events?task=7", "text/event-stream", "known are: after, id, limit"),
+        ("events?task=7", "text/event-stream", "known are: after, id, kind, limit, robot"),
         ("events?id=7", "text/event-stream", "a stream of events takes no 'id'"),
-        ("history?format=csv&robot=Robot1", "", "query parameter 'robot' is unknown here"),
+        ("events?robot=Robot1", "text/event-stream", "a stream of events takes no 'robot'"),
+        ("history?format=csv&task=7", "", "query parameter 'task' is unknown here"),
     ],
 )
 async def test_unknown_and_repeated_parameters_are_refused(
