@@ -9,7 +9,8 @@ they take a large part of a message's time in the engine:
 * A complete message is passed to the :class:`Receiver` from within ``data_received``, without a queue or a
   task.
 * Frames are written directly to the transport: a server's frames are neither masked nor compressed, so a
-  header of 2 to 10 bytes precedes the payload, which is not copied.
+  header of 2 to 10 bytes precedes the payload, which is not copied. In TLS they are written in pieces, so
+  that :attr:`RobotSocket.held` counts what waits.
 
 The rule for writing is the transport's own: write while :attr:`RobotSocket.writable`, then wait for
 :meth:`Receiver.on_writable`.
@@ -21,7 +22,7 @@ import asyncio
 import contextlib
 import socket
 from collections import deque
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode, Frame, Opcode
@@ -30,6 +31,7 @@ from websockets.protocol import State
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
 from rce.liveness.websocket import WatchedConnection
+from rce.tls.pieces import PiecewiseTransport
 from rce_robot.doors.client.frames import (
     FIN_BINARY,
     FIN_TEXT,
@@ -94,6 +96,8 @@ class RobotSocket(WatchedConnection, GuardedConnection):
     _user = ""
     _begin = 0
     """How much of the oldest received data has been handled."""
+    _pieces: PiecewiseTransport | None = None
+    """The transport, in TLS."""
     receiver: Receiver | None = None
     """Receives messages. Set while the handshake is answered."""
 
@@ -199,6 +203,9 @@ class RobotSocket(WatchedConnection, GuardedConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Prepare the socket for small and timely messages."""
+        if transport.get_extra_info("sslcontext") is not None:
+            tls = cast("asyncio.Transport", transport)  # uvloop's only behave like one
+            transport = self._pieces = PiecewiseTransport(tls, lambda: self.paused)
         self._pongs = Pongs()
         super().connection_made(transport)
         self._input: deque[bytes] = deque()
@@ -277,6 +284,10 @@ class RobotSocket(WatchedConnection, GuardedConnection):
     def resume_writing(self) -> None:
         """Answer the newest ping, and tell the receiver."""
         super().resume_writing()
+        if self._pieces is not None:
+            self._pieces.go_on()
+            if self.paused:
+                return
         if (pong := self._pongs.pop()) and self.protocol.state is State.OPEN:
             self.transport.write(pong)
         if self.receiver is not None:
@@ -286,6 +297,8 @@ class RobotSocket(WatchedConnection, GuardedConnection):
         """Tell the receiver."""
         self._forget_work()
         self._forget_input()
+        if self._pieces is not None:
+            self._pieces.forget()
         self._steps.allow(None)
         if self._share is not None:
             self._share.forget(self._user, self)
