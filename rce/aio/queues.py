@@ -196,12 +196,10 @@ class BoundedQueue(Generic[T]):
         return False
 
     def shed(self, size: int) -> None:
-        """Drop the oldest items until ``size`` bytes are free; those that are kept go last."""
+        """Drop the oldest items that are not kept, until ``size`` bytes are free or all others are kept."""
         goal = self.bytes - size
-        while self._entries and self.bytes > goal:
-            if not self.drop_oldest():
-                self._kept.clear()
-                self.kept_bytes = 0
+        while self.bytes > goal and self.drop_oldest():
+            pass
 
     def remove(self, matches: Callable[[T], bool]) -> bool:
         """Remove the oldest item that matches, which does not count as dropped; return False if none does."""
@@ -221,6 +219,12 @@ class BoundedQueue(Generic[T]):
         del self._entries[index]
         self._forget(kept)
         return True
+
+    def release(self, key: Hashable) -> None:
+        """Have the item kept for a key, if there is one, count and be dropped like others from now on."""
+        kept = self._kept.pop(key, None)
+        if kept is not None:
+            self.kept_bytes -= kept[1]
 
     def clear(self) -> None:
         """Remove all items; they do not count as dropped."""

@@ -67,8 +67,12 @@ class Holdings:
     def shed(self, size: int) -> None:
         """Drop the oldest droppable entries, until ``size`` bytes are free."""
         goal = self.bytes - size
+        self.shed_until(lambda: self.bytes <= goal)
+
+    def shed_until(self, is_enough: Callable[[], bool]) -> None:
+        """Drop the oldest droppable entries, until it is enough or none is left."""
         for holding in list(self._held):
-            if self.bytes <= goal:
+            if is_enough():
                 return
             give_up = holding._give_up  # noqa: SLF001 - same module
             if holding in self._held and give_up is not None:

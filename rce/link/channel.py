@@ -69,8 +69,16 @@ class Channel:
         return bool(self._calls) or bool(self._queue) or (server is not None and server.serves(self))
 
     def shed(self, size: int) -> None:
-        """Drop the oldest messages of a topic, until ``size`` bytes are free."""
+        """Drop the oldest messages of a topic, until ``size`` bytes are free; latched ones stay."""
         self._queue.shed(size)
+
+    def withdraw_latched(self, source: int) -> None:
+        """Take the unsent latched message of a source back."""
+        self._queue.withdraw_latched(source)
+
+    def release_latched(self, source: int) -> None:
+        """Have the unsent latched message of a source that ended be dropped like others."""
+        self._queue.release_latched(source)
 
     @property
     def number(self) -> int:

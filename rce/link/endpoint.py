@@ -134,14 +134,15 @@ class Endpoint:
     def shed(self, size: int) -> None:
         """Drop held payloads until ``size`` bytes are free, or nothing is left to drop.
 
-        First the oldest messages of topics, where most waits; then the oldest requests and latched messages.
+        First the oldest messages of topics, where most waits; then the oldest requests and latched messages,
+        also those that wait to be sent.
         """
         goal = self.waiting_bytes - size
         for channel in sorted(self._channels, key=lambda channel: -channel.waiting_bytes):
             if self.waiting_bytes <= goal:
                 return
             channel.shed(self.waiting_bytes - goal)
-        self._holdings.shed(self.waiting_bytes - goal)
+        self._holdings.shed_until(lambda: self.waiting_bytes <= goal)
 
     def drop_unfinished(self, size: int) -> None:
         """Drop messages that have not come as a whole yet, until ``size`` bytes are free.

@@ -37,17 +37,27 @@ class LatchedMessages:
 
     Args:
         holdings: Where the bytes are entered.
-        on_given_up: Called when memory is short, after a source's message was thrown away.
+        on_given_up: Called with the number of a source whose message was thrown away: memory is short.
+        on_ended: Called with the number of a source that was forgotten otherwise.
     """
 
-    def __init__(self, holdings: Holdings, on_given_up: Callable[[], None]) -> None:
+    def __init__(
+        self, holdings: Holdings, on_given_up: Callable[[int], None], on_ended: Callable[[int], None]
+    ) -> None:
         self._holdings = holdings
         self._on_given_up = on_given_up
+        self._on_ended = on_ended
         self._kept: dict[str, Kept] = {}
         self._numbers = itertools.count(1)
 
+    def __contains__(self, source: object) -> bool:
+        return source in self._kept
+
     def __iter__(self) -> Iterator[Kept]:
-        return iter(list(self._kept.values()))
+        """Iterate over the messages, without those that are thrown away meanwhile."""
+        for source, kept in list(self._kept.items()):
+            if self._kept.get(source) is kept:
+                yield kept
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -55,7 +65,11 @@ class LatchedMessages:
         return tuple(kept.number for kept in self._kept.values())
 
     def keep(self, source: str, payload: bytes | memoryview) -> int:
-        """Keep a message in place of the last one of its source; return the source's number."""
+        """Keep a message in place of the last one of its source.
+
+        Returns:
+            The source's number; 0 if the message was thrown away at once.
+        """
         kept = self._kept.get(source)
         if kept is None:
             if len(self._kept) >= MAX_SOURCES:
@@ -65,8 +79,9 @@ class LatchedMessages:
             kept.holding.release()
         kept.payload = payload
         holding = self._holdings.hold(len(payload), lambda: self._give_up(source, kept))
-        if self._kept.get(source) is kept:  # otherwise it was dropped at once
-            kept.holding = holding
+        if self._kept.get(source) is not kept:
+            return 0
+        kept.holding = holding
         return kept.number
 
     def retain(self, sources: Collection[str]) -> bool:
@@ -79,12 +94,13 @@ class LatchedMessages:
     def _give_up(self, source: str, kept: Kept) -> None:
         if self._kept.get(source) is kept:
             del self._kept[source]
-            self._on_given_up()
+            self._on_given_up(kept.number)
 
     def _forget(self, source: str) -> None:
         kept = self._kept.pop(source)
         if kept.holding is not None:
             kept.holding.release()
+        self._on_ended(kept.number)
 
 
 class HeardSources:

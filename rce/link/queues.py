@@ -182,8 +182,21 @@ class OutgoingQueue:
         self._count(self._waiting.bytes - before)
         return found
 
+    def withdraw_latched(self, source: int) -> None:
+        """Take the newest latched message of a source back, if it has not begun."""
+        before = self._waiting.bytes
+        self._waiting.remove_kept(source)
+        self._count(self._waiting.bytes - before)
+
+    def release_latched(self, source: int) -> None:
+        """Have the newest latched message of a source be dropped like others: the source ended."""
+        self._waiting.release(source)
+
     def shed(self, size: int) -> None:
-        """Drop the oldest messages of a topic that have not begun, until ``size`` bytes are free."""
+        """Drop the oldest messages of a topic that have not begun, until ``size`` bytes are free.
+
+        Those that are kept stay.
+        """
         if self._waiting.policy is OverflowPolicy.DROP_OLDEST:
             before = self._waiting.bytes
             self._waiting.shed(size)

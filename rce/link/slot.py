@@ -58,7 +58,7 @@ class InterfaceSlot:
         self._others: dict[Channel, None] = {}
         """Channels to copies of peers and to former places of peers: nothing is sent on them."""
         self._holdings = Holdings() if holdings is None else holdings
-        self._latched = LatchedMessages(self._holdings, self._latched_given_up)
+        self._latched = LatchedMessages(self._holdings, self._latched_given_up, self._source_ended)
         self._heard = HeardSources()
         self._faults: set[str] = set()
 
@@ -81,6 +81,8 @@ class InterfaceSlot:
             return
         number = self._latched.keep(source, data) if latched else 0
         for channel in self._channels.values():
+            if latched and source not in self._latched:
+                return  # memory is short: it was thrown away, which was told
             channel.send(data, source=number)
 
     def keep_latched(self, sources: Collection[str]) -> None:
@@ -223,7 +225,13 @@ class InterfaceSlot:
         for channel in self._channels.values():
             channel.send_sources(self._latched.numbers)
 
-    def _latched_given_up(self) -> None:
+    def _source_ended(self, number: int) -> None:
+        for channel in [*self._channels.values(), *self._others]:
+            channel.release_latched(number)
+
+    def _latched_given_up(self, number: int) -> None:
+        for channel in [*self._channels.values(), *self._others]:
+            channel.withdraw_latched(number)  # it refers to the same bytes
         self.counters.dropped += 1
         self._fault_once("memory is short; its latched message was dropped")
         self._send_sources()

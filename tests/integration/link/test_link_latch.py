@@ -17,6 +17,7 @@ from rce.link.settings import LinkLimits
 if TYPE_CHECKING:
     from .conftest import Rig
 
+MIB = 1 << 20
 TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
 
 
@@ -42,6 +43,27 @@ async def test_a_later_peer_gets_one_message_of_each_source(rig: Rig, way: str) 
     await heard.until_latched(b"newer")
     await b.apply(connections=[])
     await heard.until_latched()
+
+
+async def test_short_memory_takes_other_messages_first(rig: Rig) -> None:
+    """A latched message that waits on a slow link comes; one that had to go is told of."""
+    a, b = await rig.pair("unix")
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    port, heard = a.fakes["i1"].port, b.fakes["i1"]
+    port.send(bytes(8 * MIB))  # more than the socket takes at once
+    port.send(bytes(MIB))
+    port.send(b"map" * MIB, latched=True, source="x")
+    a.endpoint.shed(MIB)
+    assert not a.faults
+    await heard.until_latched(b"map" * MIB)
+    port.send(bytes(8 * MIB))
+    port.send(b"new" * MIB, latched=True, source="x")
+    port.send(b"of y", latched=True, source="y")
+    a.endpoint.shed(4 * MIB)
+    assert a.faults == ["interface i1: memory is short; its latched message was dropped"]
+    assert a.endpoint.waiting_bytes < 9 * MIB
+    await heard.until_latched(b"of y")
 
 
 @pytest.mark.parametrize("way", ["unix", "tcp"])

@@ -75,17 +75,19 @@ def test_both_items_of_a_key_leave_where_there_is_room() -> None:
     assert take_all(queue) == ["old", "new"]
 
 
-def test_shedding_takes_kept_items_last() -> None:
+def test_shedding_leaves_kept_items() -> None:
     queue: BoundedQueue[str] = BoundedQueue(5, 100)
     queue.put("map", 10, "map")
     queue.put("1", 10)
     queue.put("2", 10)
     queue.shed(11)
     assert list(queue) == ["map"]
-    queue.shed(0)
-    assert list(queue) == ["map"]
     queue.shed(1)
-    assert (len(queue), queue.bytes, queue.kept_bytes, queue.dropped) == (0, 0, 0, 3)
+    assert list(queue) == ["map"]
+    queue.release("map")
+    assert (queue.bytes, queue.kept_bytes) == (10, 0)
+    queue.shed(1)
+    assert (len(queue), queue.bytes, queue.dropped) == (0, 0, 3)
 
 
 def test_what_is_removed_is_not_counted_as_dropped() -> None:
@@ -199,11 +201,14 @@ class QueueModel(RuleBasedStateMachine):
     @rule(size=SIZES)
     def shed(self, size: int) -> None:
         goal = sum(entry[1] for entry in self.model) - size
-        while self.model and sum(entry[1] for entry in self.model) > goal:
-            if not self.droppable():
-                self.model = [(number, its_size, None) for number, its_size, _ in self.model]
+        while self.droppable() and sum(entry[1] for entry in self.model) > goal:
             self.drop()
         self.queue.shed(size)
+
+    @rule(key=KEYS)
+    def release(self, key: str) -> None:
+        self.model = [(*entry[:2], None) if entry[2] == key else entry for entry in self.model]
+        self.queue.release(key)
 
     @rule()
     def clear(self) -> None:
