@@ -84,6 +84,7 @@ class _Connection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._deadline: asyncio.TimerHandle | None = None
         self._full = False
+        self._is_head = False
 
     @property
     def is_idle(self) -> bool:
@@ -158,6 +159,7 @@ class _Connection(asyncio.Protocol):
                 self._send(h11.InformationalResponse(status_code=100, headers=[]))
             return False
         if isinstance(event, h11.Request):
+            self._is_head = event.method == b"HEAD"
             if event.method != b"POST":
                 self._refuse(405, "XML-RPC comes by POST")
             elif any(name in _OF_BROWSERS for name, _ in event.headers):
@@ -206,7 +208,8 @@ class _Connection(asyncio.Protocol):
             headers.append((b"Connection", b"close"))
         reason = HTTPStatus(status).phrase.encode()
         self._send(h11.Response(status_code=status, reason=reason, headers=headers))
-        self._send(h11.Data(data=body))
+        if not self._is_head:  # whose answer has no body
+            self._send(h11.Data(data=body))
         self._send(h11.EndOfMessage())
 
     def _send(self, event: h11.Event) -> None:

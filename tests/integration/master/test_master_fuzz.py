@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import re
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
+from aiohttp import web
 from support.fuzzing import Tracebacks, exchange, requests
 
+from rce.config import Secret
+from rce.guard import TrustedProxies
+from rce.web.server import HttpServer
 from rce_master.http.api import ROUTES
+from rce_master.http.forward import Forwarder
+from rce_master.http.forwarded import ForwardingKey
+from rce_master.http.standby import make_standby_app
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from integration.master.conftest import Site
 
+    from rce_master.follower import StateFollower
+    from rce_master.leadership.keeper import LeadershipKeeper
+
 COUNT = 600
 PREFIX = "/api/v1"
 PATHS = [PREFIX + route.path for route in ROUTES]
 PATHS += ["/", "/healthz", "/metrics", f"{PREFIX}/openapi.json", "/nothing", "*", "http://[::1"]
+OWN = ("/healthz", "/metrics")
+"""What a stand-by answers itself."""
 FAULTS = {500, 501, 502, 504}
 
 
@@ -44,6 +57,28 @@ async def test_raw_requests(world: Site) -> None:
             answers = await exchange(port, request)
             assert not FAULTS & set(answers), request
             assert not log.found, (request, log.found)
+
+
+async def test_raw_requests_to_a_standby() -> None:
+    """It sends them on to a leader, which refuses them all."""
+
+    async def refuse(_: web.Request) -> web.Response:
+        return web.json_response({"error": "no"}, status=401)
+
+    leading = web.Application()
+    leading.router.add_route("*", "/{rest:.*}", refuse)
+    key = ForwardingKey(Secret("secret of the tests"))
+    async with HttpServer(leading, "127.0.0.1", 0) as leader, Forwarder(key, TrustedProxies()) as forwarder:
+        member = SimpleNamespace(url=leader.url, name="m1", term=1)
+        keeper = cast("LeadershipKeeper", SimpleNamespace(leader=member, fault="", is_drained=False))
+        app = make_standby_app(keeper, cast("StateFollower", SimpleNamespace()), forwarder, ())
+        async with HttpServer(app, "127.0.0.1", 0) as standby:
+            port = int(standby.url.rpartition(":")[2].rstrip("/"))
+            with Tracebacks().watching() as log:
+                for request in requests([path for path in PATHS if path not in OWN], COUNT // 4):
+                    answers = await exchange(port, request)
+                    assert not FAULTS & set(answers), request
+                    assert not log.found, (request, log.found)
 
 
 @pytest.mark.parametrize(
