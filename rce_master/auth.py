@@ -22,7 +22,7 @@ from rce_master.state.user_records import KnownLogin, User
 from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
     from rce_master.state.tables import Tables
 
@@ -76,7 +76,8 @@ class Authenticator:
         tables: The state's tables, to read users and marks from.
         hasher: How passwords are hashed.
         clock: Seconds that never go back.
-        key: The key of the marks; a new key invalidates all of them. None: a random one.
+        keys: Returns the keys of the marks, the current one first; marks of a key that it returns no more
+            are invalid. None: a random one.
         remember: Stores a user's mark; without it marks are not stored.
     """
 
@@ -86,13 +87,14 @@ class Authenticator:
         *,
         hasher: PasswordHasher | None = None,
         clock: Callable[[], float] = time.monotonic,
-        key: bytes | None = None,
+        keys: Callable[[], Sequence[bytes]] | None = None,
         remember: Callable[[KnownLogin], Awaitable[object]] | None = None,
     ) -> None:
         self._tables = tables
         self._hasher = hasher or PasswordHasher()
         self._clock = clock
-        self._key = secrets.token_bytes(32) if key is None else key
+        own = (secrets.token_bytes(32),)
+        self._keys: Callable[[], Sequence[bytes]] = (lambda: own) if keys is None else keys
         self._remember = remember
         self._known: dict[str, str] = {}
         """Marks by user, of this run; the tables have those of earlier runs."""
@@ -120,8 +122,10 @@ class Authenticator:
         """
         user = self._tables.users.get(name)
         stored = user.password if user else self._unknown_user
-        mark = self._mark(name, stored, digest)
-        if not self._is_known(name, mark):
+        mark, *former = self._marks(name, stored, digest)
+        if any(self._is_known(name, one) for one in former):
+            await self._know(name, mark)  # before the former secret is retired
+        elif not self._is_known(name, mark):
             right = await self._check(name, stored, digest, mark, address)
             if not right or user is None:
                 raise WrongCredentialsError("unknown user or wrong password")
@@ -154,7 +158,7 @@ class Authenticator:
             stored: The result of :meth:`hash` for it.
             digest: SHA-256 of the password in hex.
         """
-        await self._know(name, self._mark(name, stored, digest))
+        await self._know(name, self._marks(name, stored, digest)[0])
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -214,10 +218,11 @@ class Authenticator:
         except (VerificationError, InvalidHashError):
             return False
 
-    def _mark(self, name: str, stored: str, digest: str) -> str:
+    def _marks(self, name: str, stored: str, digest: str) -> list[str]:
+        """Return the marks of a password with all keys, the current one first."""
         # The stored hash is part of it: a changed password invalidates old marks.
         text = f"{name}\0{stored}\0{digest}".encode("utf-8", "surrogatepass")
-        return hashlib.blake2b(text, key=self._key, digest_size=32).hexdigest()
+        return [hashlib.blake2b(text, key=key, digest_size=32).hexdigest() for key in self._keys()]
 
     def _is_known(self, name: str, mark: str) -> bool:
         kept = self._tables.known_logins.get(name)
@@ -229,7 +234,11 @@ class Authenticator:
             return
         self._known[name] = mark
         if self._remember is not None:
-            await self._remember(KnownLogin(user=name, mark=mark))
+            try:
+                await self._remember(KnownLogin(user=name, mark=mark))
+            except BaseException:
+                self._known.pop(name, None)  # so that the next login stores it
+                raise
 
 
 def _random_hash(hasher: PasswordHasher) -> str:

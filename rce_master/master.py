@@ -173,7 +173,7 @@ class Master:
         authenticator = Authenticator(
             state_service.tables,
             hasher=self._hasher,
-            key=self._secret.derive("known logins"),
+            keys=lambda: self._secret.derive_all("known logins"),
             remember=lambda login: state_service.enqueue([commands.RememberLogin(login=login)]),
         )
         tokens = Tokens(state_service.tables)

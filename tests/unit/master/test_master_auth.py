@@ -35,11 +35,15 @@ class Gate:
         self.world = World()
         self.hasher = hasher or CountingHasher()
         self.now = 0.0
+        self.keys = [KEY]
         self.password = self.hasher.hash(RIGHT)
         user = User(name="zoe", role=UserRole.USER, password=self.password, created=0.0)
         self.world.do(commands.AddUser(user=user))
         self.auth = Authenticator(
-            tables or self.world.state.tables, hasher=self.hasher, clock=lambda: self.now, key=KEY
+            tables or self.world.state.tables,
+            hasher=self.hasher,
+            clock=lambda: self.now,
+            keys=lambda: self.keys,
         )
 
 
@@ -143,7 +147,7 @@ async def test_a_right_password_is_known_over_a_restart(gate: Gate) -> None:
         gate.world.do(commands.RememberLogin(login=login))
 
     tables = gate.world.state.tables
-    gate.auth._remember, gate.auth._key = remember, KEY
+    gate.auth._remember = remember
     await gate.auth.verify("zoe", RIGHT)
     assert [login.user for login in kept] == ["zoe"]
     assert RIGHT not in kept[0].mark
@@ -163,11 +167,49 @@ async def test_a_right_password_is_known_over_a_restart(gate: Gate) -> None:
 
 
 async def test_marks_made_with_another_key_are_worth_nothing(gate: Gate) -> None:
-    forged = KnownLogin(user="zoe", mark=gate.auth._mark("zoe", gate.password, WRONG))
-    gate.auth._key = b"another key"
+    (mark,) = gate.auth._marks("zoe", gate.password, WRONG)
+    forged = KnownLogin(user="zoe", mark=mark)
+    gate.keys = [b"another key"]
     gate.world.do(commands.RememberLogin(login=forged))
     with pytest.raises(WrongCredentialsError):
         await gate.auth.verify("zoe", WRONG)
+
+
+async def test_password_is_known_over_rotated_secrets(gate: Gate) -> None:
+    """Its mark is renewed while the former secret is accepted, and holds when that is retired."""
+
+    async def remember(login: KnownLogin) -> None:
+        gate.world.do(commands.RememberLogin(login=login))
+
+    tables = gate.world.state.tables
+    gate.auth._remember = remember
+    await gate.auth.verify("zoe", RIGHT)
+    for keys in ([b"new", KEY], [b"new"]):
+        restarted = Gate(tables, gate.hasher)
+        restarted.keys = keys
+        restarted.auth._remember = remember
+        try:
+            before = gate.hasher.verified
+            assert (await restarted.auth.verify("zoe", RIGHT)).name == "zoe"
+            assert gate.hasher.verified == before
+        finally:
+            restarted.auth.close()
+
+
+async def test_mark_is_stored_later_if_the_store_failed(gate: Gate) -> None:
+    kept: list[KnownLogin] = []
+
+    async def remember(login: KnownLogin) -> None:
+        if gate.now == 0.0:
+            raise OSError("the disk is full")
+        kept.append(login)
+
+    gate.auth._remember = remember
+    with pytest.raises(OSError, match="full"):
+        await gate.auth.verify("zoe", RIGHT)
+    gate.now = 1.0
+    await gate.auth.verify("zoe", RIGHT)
+    assert [login.user for login in kept] == ["zoe"]
 
 
 async def test_a_changed_password_makes_the_old_one_worthless(gate: Gate) -> None:
