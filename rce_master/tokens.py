@@ -96,6 +96,12 @@ class Tokens:
         used, self._used = self._used, {}
         return commands.NoteTokenUses(used=used)
 
+    def uses_of(self, user: str) -> commands.NoteTokenUses:
+        """Do what :meth:`uses` does, for the tokens of one user."""
+        digests = [token.digest for token in self._tables.tokens.by("user", user)]
+        used = {digest: self._used.pop(digest) for digest in digests if digest in self._used}
+        return commands.NoteTokenUses(used=used)
+
     async def run(self, state_service: _Submits) -> None:
         """Note the uses again and again, until cancelled."""
         while True:

@@ -12,6 +12,7 @@ from rce_master.exceptions import (
 )
 from rce_master.state import commands
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import User, UserRole
 from rce_master.tokens import TOKEN_LIFETIME_S, Tokens, new_token
 
 
@@ -37,6 +38,19 @@ class Issuer:
 
     def digest(self, token: str) -> str:
         return self.tokens.find(token)[1].digest
+
+
+def test_uses_of_one_user_leave_those_of_others() -> None:
+    """A login writes the times of its own user only."""
+    issuer = Issuer()
+    bert = User(name="bert", role=UserRole.USER, password="", created=0.0)
+    issuer.world.do(commands.AddUser(user=bert))
+    of_bert, record = new_token("bert", "test", issuer.now)
+    issuer.world.do(commands.AddToken(token=record))
+    of_anna = issuer.add()
+    assert [issuer.tokens.find(token)[0].name for token in (of_anna, of_bert)] == ["anna", "bert"]
+    assert issuer.tokens.uses_of("anna").used == {issuer.digest(of_anna): issuer.now}
+    assert set(issuer.tokens.uses().used) == {record.digest, issuer.digest(of_anna)}
 
 
 def test_token_kept_as_digest_and_expires() -> None:
