@@ -69,6 +69,9 @@ MAX_TOGETHER = 200
 MAX_LOGINS = 4096
 """Concurrent logins; beyond it robots are told to try later. A delayed login blocks no other work."""
 
+AGAIN_S = 1.0
+"""After which a robot may try to log in again, where nothing else is known."""
+
 MAX_TERMS_AHEAD = 1_000_000
 """A task set that has seen a term so far ahead is not believed: terms must not run out."""
 
@@ -189,7 +192,9 @@ class ControlHandler:
     def _take_login(self, peer: Peer, login: Login) -> None:
         if len(self._logins) >= MAX_LOGINS:
             reason = str(TooManyLoginsError())
-            peer.send(LoginReply(request=login.request, status=_UNAVAILABLE, reason=reason))
+            peer.send(
+                LoginReply(request=login.request, status=_UNAVAILABLE, reason=reason, retry_after=AGAIN_S)
+            )
             return
         pending_login = _PendingLogin(peer.process, f"{login.user}/{login.robot}")
         self._logins.add(pending_login)
@@ -222,24 +227,26 @@ class ControlHandler:
     async def _try_login(self, process: str, id_: str, login: Login) -> LoginReply:
         if process in self._state_service.tables.drains:
             return LoginReply(request=login.request, status=_UNAVAILABLE, reason=DRAINED)
+        retry_after = 0.0
         try:
             command = await self._admission(process, id_, login)
             await self._state_service.submit(command)
             if self._is_admitted(command):
                 return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))
             status, reason = _UNAVAILABLE, "the robot was sent away while it logged in; connect again"
+            retry_after = AGAIN_S
         except WrongCredentialsError as error:
             status, reason = _UNAUTHORIZED, str(error)
-        except TooManyFailuresError as error:
-            status, reason = _TOO_MANY, str(error)
+        except (TooManyFailuresError, TooMuchError) as error:
+            status, reason, retry_after = _TOO_MANY, str(error), error.retry_after
         except ForbiddenError as error:
             status, reason = _FORBIDDEN, str(error)
         except RefusedError as error:
             status, reason = _CONFLICT, str(error)
             self._probe_previous(process, id_)
         except MasterError as error:
-            status, reason = _UNAVAILABLE, str(error)
-        return LoginReply(request=login.request, status=status, reason=reason)
+            status, reason, retry_after = _UNAVAILABLE, str(error), AGAIN_S
+        return LoginReply(request=login.request, status=status, reason=reason, retry_after=retry_after)
 
     def _is_admitted(self, command: commands.RobotLogin) -> bool:
         """Tell whether a login still holds: another command of its batch may have ended it."""
@@ -257,10 +264,12 @@ class ControlHandler:
 
         Raises:
             AuthError: The credentials are wrong, or cannot be checked now.
+            TooMuchError: The user's robots log in too often.
             ForbiddenError: The credentials are correct, but not for this robot or purpose.
         """
         if not login.token:
             user = await self._authenticator.verify(login.user, login.password, login.address)
+            self._quotas.robot_login(user)
             return commands.RobotLogin(process=process, id=id_, password=user.password)
         user, token = self._tokens.find(login.token)
         if not token.robot:
@@ -269,6 +278,7 @@ class ControlHandler:
             raise ForbiddenError(
                 "this token is good for another robot; make one for this: rce robot add ROBOT"
             )
+        self._quotas.robot_login(user)
         return commands.RobotLogin(process=process, id=id_, credential=token.digest)
 
     def _probe_previous(self, process: str, id_: str) -> None:

@@ -40,7 +40,8 @@ class QuotaSettings:
     """The quotas of one user."""
 
     requests: float = 100.0
-    """Requests over REST each second, and as many over all WebSockets of their robots; 0 for no limit."""
+    """Requests over REST each second, and as many over all WebSockets of their robots, and as many logins of
+    robots; 0 for no limit."""
     request_burst: int = 2000
     """The burst of requests after a pause."""
     streams: int = 64
@@ -63,7 +64,7 @@ class Quotas:
         self._settings = settings or QuotaSettings()
         self._clock = clock
         burst = self._settings.request_burst
-        self._rest, self._robots = (self._rates(burst) for _ in range(2))
+        self._rest, self._robots, self._logins = (self._rates(burst) for _ in range(3))
         self._replays = self._rates(min(burst, REPLAY_BURST))
         self._streams = Places(each=self._settings.streams)
         self._reads = Turns(READS_AT_ONCE, waiting=READS_WAITING, each=self._settings.log_reads)
@@ -88,6 +89,14 @@ class Quotas:
             TooMuchError: There were too many requests.
         """
         self._take(self._robots, user, 1 + items // ITEMS_PER_REQUEST)
+
+    def robot_login(self, user: User) -> None:
+        """Count a login of a robot.
+
+        Raises:
+            TooMuchError: There were too many logins.
+        """
+        self._take(self._logins, user, 1, "logins of robots")
 
     async def replay(self, user: User) -> None:
         """Count a part of the events of the past that a stream sends; wait if a user's streams sent many.
@@ -143,13 +152,13 @@ class Quotas:
             return None
         return Rates(per_second=self._settings.requests, burst=max(1, burst))
 
-    def _take(self, rates: Rates | None, user: User, cost: int) -> None:
+    def _take(self, rates: Rates | None, user: User, cost: int, what: str = "requests") -> None:
         if rates is None or user.role is UserRole.ADMIN:
             return
         wait = rates.take(user.name, self._clock(), cost)
         if wait:
             raise TooMuchError(
-                f"too many requests: you may make {self._settings.requests:g} a second; "
+                f"too many {what}: you may make {self._settings.requests:g} a second; "
                 f"try again in {math.ceil(wait)} s",
                 wait,
             )

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _OK, _UNAVAILABLE = 200, 503
+_AGAIN_S = 1.0
+"""After which a robot may try to log in again."""
 
 
 class RobotTaskSet:
@@ -211,10 +213,10 @@ class RobotTaskSet:
                 reply = await self._channel.login(who.user, who.robot, who.password, address, who.token)
         except (ControlError, TimeoutError) as error:
             reason = "The master cannot be reached, so logging in is not possible now. Try again."
-            raise HandshakeError(_UNAVAILABLE, reason) from error
+            raise HandshakeError(_UNAVAILABLE, reason, _AGAIN_S) from error
         if reply.endpoint is None:
             status = reply.status if reply.status != _OK else _UNAVAILABLE
-            raise HandshakeError(status, reply.reason or "Refused by the master.")
+            raise HandshakeError(status, reply.reason or "Refused by the master.", reply.retry_after)
         return reply.endpoint
 
     def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
@@ -230,7 +232,7 @@ class RobotTaskSet:
         namespace = await self._apply(spec, logs_in=True)
         if not self._is_current(namespace):
             reason = "The robot was sent away while it logged in; connect again."
-            raise HandshakeError(_UNAVAILABLE, reason)
+            raise HandshakeError(_UNAVAILABLE, reason, _AGAIN_S)
         return namespace
 
     async def _apply(self, spec: EndpointSpec, *, logs_in: bool = False) -> Namespace:

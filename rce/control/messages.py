@@ -347,14 +347,14 @@ class Probe(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class LoginReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Answer to :class:`Login`."""
+    """Answer to :class:`Login`: the robot's desired state if it may come in, else when it may try again."""
 
     request: int
     endpoint: EndpointSpec | None = None
-    """The robot's desired state if it may come in."""
     status: int = 200
     """HTTP status for the handshake: 200, 401, 409 (already connected), 429, 503."""
     reason: str = ""
+    retry_after: float = 0.0  # seconds; 0: not said
 
 
 class RequestFault(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -60,14 +60,16 @@ class HandshakeError(ProtocolError):
     Attributes:
         status: HTTP status to answer.
         reason: Plain text body to answer.
+        retry_after: Seconds until the next attempt; 0: not said.
     """
 
-    def __init__(self, status: int, reason: str) -> None:
+    def __init__(self, status: int, reason: str, retry_after: float = 0.0) -> None:
         # It may quote bytes of the request that are not text and cannot be sent back.
         reason = reason.encode("utf-8", "backslashreplace").decode()
         super().__init__(status, reason)
         self.status = status
         self.reason = reason
+        self.retry_after = retry_after
 
     def __str__(self) -> str:
         return self.reason

@@ -26,10 +26,11 @@ async def log_in(call: Call) -> models.TokenOut:
     body = call.read(models.LoginIn)
     services = call.services
     user = await services.authenticator.verify(body.userID, client_digest(body.password), call.address)
+    services.quotas.request(user)
     lifetime = min(body.lifetime or services.token_lifetime, services.token_lifetime)
     token, record = new_token(user.name, body.label, services.clock(), lifetime)
     # A recently used token must not be dropped for this one.
-    uses = services.tokens.uses()
+    uses = services.tokens.uses_of(user.name)
     _, outcome = await services.state_service.submit_all(
         [uses, commands.AddToken(token=record, password=user.password)]
     )

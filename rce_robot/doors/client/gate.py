@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -66,7 +67,10 @@ class Gate:
             namespace = await self._claim(credentials, address)
         except HandshakeError as error:
             self._log_refusal(connection, error)
-            return connection.respond(error.status, f"{error.reason}\n")
+            response = connection.respond(error.status, f"{error.reason}\n")
+            if error.retry_after:
+                response.headers["Retry-After"] = str(math.ceil(error.retry_after))
+            return response
         client = f"{address or 'an unknown address'} since {_clock()} UTC"
         features = read_features(query)
         session = Session(

@@ -26,6 +26,12 @@ if TYPE_CHECKING:
 
 
 SMALL = QuotaSettings(requests=1, request_burst=20, streams=3, log_reads=2)
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
 HEADERS = {"Content-Type": "application/gzip"}
 
 
@@ -56,6 +62,36 @@ async def test_requests_over_rest(run_site: RunSite) -> None:
         await site.api("GET", "/robots", token=bert)
         for _ in range(60):  # administrators have no quotas
             await site.api("GET", "/robots")
+
+
+async def test_logins_with_the_right_password(run_site: RunSite) -> None:
+    async with two_users(run_site) as (site, _, _):
+
+        async def log_in() -> tuple[int, str | None]:
+            body = {"userID": "anna", "password": "anna"}
+            async with site.session.post(f"{site.url}api/v1/login", json=body) as reply:
+                return reply.status, reply.headers.get("Retry-After")
+
+        answers = await asyncio.gather(*(log_in() for _ in range(60)))
+        assert {status for status, _ in answers} == {200, 429}
+        assert all(wait is not None and int(wait) >= 1 for status, wait in answers if status == 429)
+        assert await site.login("bert", "bert")
+
+
+async def test_logins_of_robots(run_site: RunSite) -> None:
+    """The handshake says when to try again; a robot of another user gets in."""
+    async with two_users(run_site) as (site, _, _), robot_task_set(site.master.control_port, SECRET) as url:
+
+        async def connect(user: str, robot: str) -> tuple[int, str | None]:
+            query = f"userID={user}&robotID={robot}&password={client_digest(user)}"
+            address = url.replace("ws", "http", 1)
+            async with site.session.get(f"{address}?{query}", headers=UPGRADE) as reply:
+                return reply.status, reply.headers.get("Retry-After")
+
+        answers = await asyncio.gather(*(connect("anna", f"r{number}") for number in range(60)))
+        assert {status for status, _ in answers} == {101, 429}
+        assert all(wait is not None and int(wait) >= 1 for status, wait in answers if status == 429)
+        assert (await connect("bert", "rob"))[0] == 101
 
 
 async def test_requests_of_robots(run_site: RunSite) -> None:
