@@ -21,6 +21,7 @@ from rce.config import (
     fields_of,
     read_store_address,
 )
+from rce.own_process import machine_memory
 from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
@@ -141,10 +142,14 @@ def programs(settings: EngineSettings, masters: Replicas | None = None) -> Itera
         document["master_host"] = masters.master_host
         yield from masters.programs(document)
     robot = settings.robot
+    if robot.count > 1:  # together they hold no more than one would
+        memory = (robot.memory or machine_memory() // 2) // robot.count
+        settings = replace(settings, robot=replace(robot, memory=memory))
+    shared = _document(settings).get("robot", {})
     link_port = ROBOT_LINK_PORT if robot.link_port is None else robot.link_port
     for index in range(robot.count):
         ports = {"ws_port": _next(robot.ws_port, index), "link_port": _next(link_port, 2 * index)}
-        own = document | {"robot": document.get("robot", {}) | ports}
+        own = document | {"robot": shared | ports}
         if index and settings.log_dir is not None:  # two programs cannot rotate one file
             own["log_dir"] = str(settings.log_dir.absolute() / f"robot{index + 1}")
         yield _program(f"robot{index + 1}" if robot.count > 1 else "robot", "rce_robot", own)

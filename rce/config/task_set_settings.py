@@ -74,9 +74,18 @@ class RobotSettings(Section, frozen=True, kw_only=True):
     user_memory: Annotated[
         Memory,
         Meta(ge=1 << 20),
-        Setting("Messages that may wait for all robots of a user; beyond it the oldest are dropped."),
+        Setting(
+            "Messages that may wait for all robots of a user at one robot process; beyond it the oldest are"
+            " dropped."
+        ),
     ] = 512 << 20
-    memory: Annotated[Memory, Setting("The same for all users; 0: half of the machine's memory.")] = 0
+    memory: Annotated[
+        Memory,
+        Setting(
+            "The same for all users; 0: half of the machine's memory. The robot processes of `rce up` share"
+            " it equally."
+        ),
+    ] = 0
     strangers: Annotated[
         int, Meta(ge=1), Setting("Connections from one address that have not logged in yet.")
     ] = 256

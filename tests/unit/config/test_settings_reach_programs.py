@@ -22,6 +22,7 @@ from rce.config.settings import (
     Runtime,
     TlsSettings,
 )
+from rce.own_process import machine_memory
 from rce.tls.choice import WARNED_VARIABLE
 from rce_container.command import OPTIONS as CONTAINER
 from rce_container.command import app as container
@@ -89,8 +90,9 @@ def test_what_is_set_arrives() -> None:
     found = received(SETTINGS)
     assert found["master"] == SETTINGS
     assert found["container"] == SETTINGS
-    assert found["robot1"].robot == replace(SETTINGS.robot, link_port=10030)
-    assert found["robot2"].robot == replace(SETTINGS.robot, ws_port=9011, link_port=10032)
+    shared = replace(SETTINGS.robot, memory=machine_memory() // 2 // 2)
+    assert found["robot1"].robot == replace(shared, link_port=10030)
+    assert found["robot2"].robot == replace(shared, ws_port=9011, link_port=10032)
     assert (str(found["robot1"].log_dir), str(found["robot2"].log_dir)) == ("/log", "/log/robot2")
 
 
@@ -99,6 +101,14 @@ def test_defaults_arrive() -> None:
     assert set(found) == {"master", "robot", "container"}
     assert {each.master_host for each in found.values()} == {"127.0.0.1"}
     assert (found["robot"].robot.link_port, found["container"].container.link_port) == (10030, 10031)
+
+
+@pytest.mark.parametrize(("memory", "each"), [(8 << 30, 2 << 30), (0, machine_memory() // 2 // 4)])
+def test_robot_programs_share_the_memory(memory: int, each: int) -> None:
+    found = received(EngineSettings(dev=True, robot=RobotSettings(count=4, memory=memory)))
+    assert [found[f"robot{number}"].robot.memory for number in range(1, 5)] == [each] * 4
+    alone = received(EngineSettings(dev=True, robot=RobotSettings(memory=memory)))
+    assert alone["robot"].robot.memory == memory
 
 
 @pytest.mark.parametrize(
