@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -29,6 +30,16 @@ def made(tmp_path_factory):
 def test_uses_it(made, number):
     time.sleep(0.1)
 """
+
+
+def test_packages_that_tests_need_are_in_the_list() -> None:
+    """Those that a skipped test names are what ``.ci/run`` installs."""
+    text = (ROOT / ".ci" / "packages.txt").read_text()
+    listed = {name for line in text.splitlines() for name in line.partition("#")[0].split()}
+    checks = (ROOT / "tests" / "conftest.py").read_text()
+    named = {name for group in re.findall(r"\(Debian: ([^);]*)", checks) for name in group.split()}
+    assert len(named) > 20
+    assert named - {"..."} <= listed
 
 
 def run_ci(folder: Path, lint: int, docs: int, loops: int, tests: int) -> subprocess.CompletedProcess[str]:
