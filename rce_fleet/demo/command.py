@@ -175,6 +175,8 @@ def demo(
         fleet = _choose_fleet(count, full_stack, floor, seed, scen, ways)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
         _check_duration(duration, timeout, mode, headless=headless)
+        if blocked_cells:
+            _check_blocked(duration, headless=headless)
         if duration is not None and replicas == 1:  # else masters are killed, not the planner
             _check_kills(duration, count)
         if report is not None and headless:
@@ -279,6 +281,14 @@ def _check_duration(duration: float | None, timeout: float | None, mode: Mode, *
         raise DemoError("--duration is for headless runs: add --headless")
     if duration is not None and mode is not Mode.CLOUD:
         raise DemoError(f"--duration kills the planner's container: use --mode cloud, not --mode {mode}")
+
+
+def _check_blocked(duration: float | None, *, headless: bool) -> None:
+    """Raise DemoError if the run blocks no cells."""
+    if not headless:
+        raise DemoError("--blocked-cells is for headless runs: add --headless")
+    if duration is not None:
+        raise DemoError("--blocked-cells is for runs in which each robot drives to one goal: omit --duration")
 
 
 def _check_kills(duration: float, robots: int) -> None:

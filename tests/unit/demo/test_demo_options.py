@@ -65,6 +65,7 @@ async def test_a_demo_without_a_standard_input_has_no_key(monkeypatch: pytest.Mo
             ("--duration", "2"),
             "--duration 2 is too short to kill the planner 2 times with 3 robots: give at least 3 s",
         ),
+        (("--duration", "60", "--blocked-cells", "2"), "drives to one goal: omit --duration"),
         (("--state-dir", "/dev/null/state"), "--state-dir /dev/null/state cannot be used: Not a directory"),
     ],
 )
@@ -75,6 +76,12 @@ def test_headless_options_that_cannot_be_met_are_refused(
     monkeypatch.chdir(tmp_path)
     found = CliRunner().invoke(app, ["--headless", *options])
     assert (found.exit_code, words in found.output) == (1, True), found.output
+
+
+def test_blocked_cells_need_a_headless_run() -> None:
+    found = CliRunner().invoke(app, ["--blocked-cells", "2"])
+    assert found.exit_code == 1
+    assert "--blocked-cells is for headless runs: add --headless" in found.output
 
 
 def test_a_report_that_cannot_be_written_at_the_end_is_a_fault(
