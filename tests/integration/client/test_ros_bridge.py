@@ -159,14 +159,15 @@ async def test_another_of_its_name_takes_its_place(engine: Engine, tmp_path: Pat
 
 
 async def test_ends_when_its_node_is_killed_in_the_graph(engine: Engine, tmp_path: Path) -> None:
-    """As by Ctrl-C, also while it waits for a robotID that is in use."""
+    """As by Ctrl-C, also while it waits for a robotID that is in use, which it says every few seconds."""
     path = write(tmp_path, config(engine.door.url))
     async with (
         engine.connection(),
         Core(host="127.0.0.1", port=0) as core,
         program(path, master=core.uri) as bridge,
     ):
-        await bridge.until("the robotID is in use")
+        for _ in range(2):
+            await bridge.until("the robotID is in use")
         async with RpcClient() as rpc:
             _, _, uri = await rpc.call(core.uri, "lookupNode", ("/test", "/rce_ros_testRobot"))
             await rpc.call(uri, "shutdown", ("/rosnode-1", "user request"))
