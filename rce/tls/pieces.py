@@ -20,8 +20,8 @@ PIECE = 64 << 10
 class PiecewiseTransport(asyncio.Transport):
     """Takes the place of a TLS transport for its protocol.
 
-    The protocol calls :meth:`go_on` when the transport has told it to resume, and :meth:`forget` when the
-    connection is lost.
+    The protocol calls :meth:`resume_sending` when the transport has told it to resume, and :meth:`forget`
+    when the connection is lost.
 
     Args:
         transport: The TLS transport.
@@ -51,9 +51,9 @@ class PiecewiseTransport(asyncio.Transport):
             if len(data):
                 self._kept.append(memoryview(data))
                 self._kept_bytes += len(data)
-        self.go_on()
+        self.resume_sending()
 
-    def go_on(self) -> None:
+    def resume_sending(self) -> None:
         """Write what was kept, as far as the transport takes it; then close, if that was asked for."""
         while self._kept and not self._is_paused():
             self._transport.writelines(self._next_piece())
@@ -68,7 +68,7 @@ class PiecewiseTransport(asyncio.Transport):
     def close(self) -> None:
         """Close the transport when it has taken everything."""
         self._closing = True
-        self.go_on()
+        self.resume_sending()
 
     def abort(self) -> None:
         """Close the transport at once."""

@@ -285,7 +285,7 @@ class RobotSocket(WatchedConnection, GuardedConnection):
         """Answer the newest ping, and tell the receiver."""
         super().resume_writing()
         if self._pieces is not None:
-            self._pieces.go_on()
+            self._pieces.resume_sending()
             if self.paused:
                 return
         if (pong := self._pongs.pop()) and self.protocol.state is State.OPEN:
