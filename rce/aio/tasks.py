@@ -18,6 +18,26 @@ T = TypeVar("T")
 E = TypeVar("E", bound=BaseException)
 
 
+class TaskGroup(asyncio.TaskGroup):
+    """A task group that loses no cancellation, as those of Python 3.13.
+
+    In earlier ones, a block that is cancelled at the moment at which one of its tasks fails raises the task's
+    error only: whoever catches that goes on, and the cancellation never comes.
+    """
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            await super().__aexit__(kind, error, trace)
+        except BaseExceptionGroup:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                task.uncancel()
+                task.cancel()  # comes with the next await
+            raise
+
+
 class TaskScope:
     """A task group whose end means "stop", not "wait": for the background work of a server or client.
 
@@ -32,7 +52,7 @@ class TaskScope:
     """
 
     def __init__(self) -> None:
-        self._group = asyncio.TaskGroup()
+        self._group = TaskGroup()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._leaving = False
 

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
+from rce.aio.tasks import TaskGroup
 from rce.control import (
     ClientReply,
     ClientRequest,
@@ -227,7 +228,7 @@ class TaskSetChannel:
 
     async def run(self) -> None:
         """Dial, talk, and dial again, until cancelled."""
-        async with asyncio.TaskGroup() as tasks:
+        async with TaskGroup() as tasks:
             tasks.create_task(self._handle_inbox())
             while True:
                 delay = await self._connect_once()
@@ -340,7 +341,7 @@ class TaskSetChannel:
         self._outbox = outbox
         failure: Exception | None = None
         try:
-            async with asyncio.TaskGroup() as tasks:
+            async with TaskGroup() as tasks:
                 writer = tasks.create_task(self._write(socket, outbox))
                 await self._read(socket)
                 writer.cancel()

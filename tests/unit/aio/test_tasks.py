@@ -9,6 +9,7 @@ import pytest
 
 from rce.aio.tasks import (
     BackgroundTasks,
+    TaskGroup,
     TaskScope,
     cancel_and_wait,
     finish,
@@ -34,6 +35,40 @@ async def reported() -> Reported:
     found: Reported = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: found.append(context["exception"]))
     return found
+
+
+@pytest.mark.parametrize("owner", ["group", "scope"])
+async def test_no_cancellation_is_lost_beside_a_failure(owner: str) -> None:
+    """A program is told to end at the moment at which its master ends, and its connection with it."""
+    caught: list[str] = []
+
+    async def end_all() -> None:
+        await asyncio.sleep(0)
+        trying.cancel()
+        raise ValueError("broken")
+
+    async def run_once() -> None:
+        if owner == "group":
+            async with TaskGroup() as group:
+                group.create_task(end_all())
+                await for_ever()
+        else:
+            async with TaskScope() as scope:
+                scope.spawn(end_all(), name="end")
+                await for_ever()
+
+    async def try_again() -> None:
+        try:
+            await run_once()
+        except* ValueError:
+            caught.append(owner)
+        await for_ever()
+
+    trying = asyncio.create_task(try_again())
+    await asyncio.wait([trying], timeout=5.0)
+    is_over = trying.cancelled()
+    trying.cancel()
+    assert (is_over, caught) == (True, [owner])
 
 
 async def test_leaving_a_scope_cancels_what_runs() -> None:
