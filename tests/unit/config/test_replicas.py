@@ -34,7 +34,7 @@ def settings_of(program: Program) -> dict[str, Any]:
 
 
 def options_of(program: Program) -> dict[str, str]:
-    words = [word for word in program.argv if not word.endswith("client-cert-auth")]
+    words = [word for word in program.argv if not word.endswith(("client-cert-auth", "pre-vote"))]
     begin = words.index("--name")
     return dict(zip(words[begin::2], words[begin + 1 :: 2], strict=True))
 
