@@ -22,7 +22,7 @@ class TaskGroup(asyncio.TaskGroup):
     """A task group that loses no cancellation, as those of Python 3.13.
 
     In earlier ones, a block that is cancelled at the moment at which one of its tasks fails raises the task's
-    error only: whoever catches that goes on, and the cancellation never comes.
+    error only: code that catches it goes on, and the cancellation never comes.
     """
 
     async def __aexit__(

@@ -120,7 +120,7 @@ class PlanResult:
         steps: Step of each visit, from 1 on.
         ordered: Whether robots that keep the plan's order never wait for each other in a circle.
         rerouting: The new paths, where only some robots get new or better ones; then there are no visits.
-        failure: Why there is no plan: the planner's error, or what is wrong with its plan; then there are no
+        failure: Why a plan is missing: the planner's error, or what is wrong with its plan; then there are no
             visits.
     """
 

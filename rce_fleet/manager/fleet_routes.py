@@ -253,7 +253,7 @@ def _event_query(call: Call) -> EventQuery:
     """Return which events are asked for.
 
     Raises:
-        BadRequestError: There is no such kind, or a number is wrong.
+        BadRequestError: The kind is unknown, or a number is wrong.
     """
     kinds = tuple(filter(None, call.query.get("kind", "").split(",")))
     known = get_args(EventKind)

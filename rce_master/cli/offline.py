@@ -114,7 +114,7 @@ def find_folder(state_dir: Path) -> Path:
     """Return the folder of a master whose store is in etcd.
 
     It is the folder itself (``rce-master --state-dir``), or ``master`` in it, if that is there or the folder
-    is of a machine of a cluster (``rce cluster``): there is no store by which to tell them apart.
+    is of a machine of a cluster (``rce cluster``): neither holds a store that would tell them apart.
     """
     inner = state_dir / MASTER_FOLDER
     return inner if inner.is_dir() or (state_dir / ETCD_FILE).exists() else state_dir

@@ -171,7 +171,7 @@ async def remove_member(
         The removed member, and the others.
 
     Raises:
-        UnknownMemberError: There is no such member.
+        UnknownMemberError: The member is unknown.
         ClusterError: The cluster would lose its quorum.
         EtcdError: etcd does not answer, or refused.
     """

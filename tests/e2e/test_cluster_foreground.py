@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shlex
 import shutil
@@ -12,7 +11,6 @@ from http import HTTPStatus
 from pathlib import Path
 
 import aiohttp
-import msgspec
 import psutil
 import pytest
 from faults.machines import fetch
@@ -20,12 +18,10 @@ from support.engine import Program, until
 from support.go_between import LOOPBACK
 from support.ports import free_ports
 from support.processes import run_to_end
+from support.stored_packages import store_package
 
 from rce.config import EngineSettings
 from rce_master.backup import MASTER, back_up
-from rce_master.state.tables import Tables
-from rce_master.state.user_records import UserPackage
-from rce_master.store import Row, SqliteStore
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd"), pytest.mark.timeout(300), pytest.mark.asyncio]
 
@@ -150,26 +146,9 @@ async def test_archives_are_restored_to_the_folder_of_the_master(tmp_path: Path)
 async def make_backup(folder: Path, archive: bytes) -> None:
     """Make ``copy.tar`` of a state with a package."""
     state = folder / "one" / "master"
-    sha256 = hashlib.sha256(archive).hexdigest()
-    package = UserPackage(
-        user="anna",
-        name="tools",
-        version="1.0",
-        sha256=sha256,
-        digest="",
-        key="",
-        signature="",
-        packed=len(archive),
-        size=1,
-        files=1,
-        created=1.0,
-    )
-    store = await SqliteStore.open(state)
-    row = Row(Tables().packages.name, package.id, msgspec.json.encode(package))
-    await store.save([row], await store.begin_term())
-    await store.close()
-    (state / "bundles").mkdir()
-    (state / "bundles" / sha256).write_bytes(archive)
+    kept = await store_package(state, archive)
+    kept.parent.mkdir()
+    kept.write_bytes(archive)
     back_up({MASTER: state}, folder / "copy.tar")
 
 

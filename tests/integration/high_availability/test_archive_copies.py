@@ -358,7 +358,7 @@ async def silent_master(pair: Pair) -> AsyncIterator[list[str]]:
 async def test_missing_contents_are_fetched_where_they_are_listed(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rce_master.packages.copies.HELD_S", 1.0, raising=False)
+    monkeypatch.setattr("rce_master.packages.copies.HELD_S", 1.0)
     pair.own.mkdir()
     there = write(pair.others, *(b"%d" % number for number in range(100)))
     async with silent_master(pair) as asked, pair.comparing(Counted(there)):
@@ -370,7 +370,7 @@ async def test_master_that_goes_silent_within_a_content_is_left(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is asked last for the next ones."""
-    monkeypatch.setattr("rce_master.packages.transfer.SILENCE_S", 2.0, raising=False)
+    monkeypatch.setattr("rce_master.packages.transfer.SILENCE_S", 2.0)
     pair.own.mkdir()
     there = write(pair.others, *(b"%d" % number for number in range(100)))
     async with silent_master(pair) as asked, asyncio.timeout(60):
@@ -388,7 +388,7 @@ async def test_send_ends_when_a_master_takes_nothing(
     pair: Pair, monkeypatch: pytest.MonkeyPatch, size: int, why: str
 ) -> None:
     """The limit for the whole archive, of more than a minute here, is that of a slow network."""
-    monkeypatch.setattr("rce_master.packages.transfer.STALL_S", 1.0, raising=False)
+    monkeypatch.setattr("rce_master.packages.transfer.STALL_S", 1.0)
     monkeypatch.setattr("rce_master.packages.transfer.ANSWER_S", 1.0)
     pair.own.mkdir()
     (large,) = hashes(1, "large")

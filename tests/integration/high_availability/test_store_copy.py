@@ -11,13 +11,13 @@ from msgspec import structs
 from support.etcd import cluster
 from support.go_between import LOOPBACK
 from support.master_program import rce
+from support.stored_packages import store_package
 
 from rce.config import STORE_FILE, EngineSettings, MasterSettings
 from rce.control.snapshots import FileEntry, Manifest
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity
 from rce_master.state.tables import Tables
-from rce_master.state.user_records import UserPackage
 from rce_master.state.volume_records import UserVolume
 from rce_master.store import Row, SqliteStore
 from rce_master.store.copying import UNFINISHED
@@ -81,25 +81,7 @@ async def test_a_state_is_copied_to_etcd_and_back(tmp_path: Path) -> None:
 
 async def add_package(folder: Path, archive: bytes) -> Path:
     """Add a package to the state; return where its archive has to be."""
-    sha256 = hashlib.sha256(archive).hexdigest()
-    package = UserPackage(
-        user="anna",
-        name="tools",
-        version="1.0",
-        sha256=sha256,
-        digest="",
-        key="",
-        signature="",
-        packed=len(archive),
-        size=1,
-        files=1,
-        created=1.0,
-    )
-    store = await SqliteStore.open(folder / "state" / "master")
-    rows = [Row(Tables().packages.name, package.id, msgspec.json.encode(package))]
-    await store.save(rows, await store.begin_term())
-    await store.close()
-    return folder / "state" / "master" / "bundles" / sha256
+    return await store_package(folder / "state" / "master", archive)
 
 
 async def test_archives_of_packages_move_too(tmp_path: Path) -> None:

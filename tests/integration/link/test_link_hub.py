@@ -159,7 +159,7 @@ async def test_many_connections_are_handed_over_in_a_burst() -> None:
 
 
 async def test_what_was_just_handed_over_is_closed_with_the_receiver() -> None:
-    """Nothing has taken it yet; what is no connection is left alone."""
+    """Nothing has taken it yet; what is not a connection is left alone."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
     async def adopt(sock: socket.socket, received: bytes) -> None:
