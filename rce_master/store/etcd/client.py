@@ -7,7 +7,6 @@ import contextlib
 import io
 import json
 import logging
-import os
 import time
 from typing import TYPE_CHECKING, Self, TypeVar
 
@@ -17,10 +16,11 @@ from rce.services.etcd import MIN_VERSION
 from rce.tls import explain_to_client
 from rce_master.exceptions import StoreError
 from rce_master.store.etcd import wire
+from rce_master.store.etcd.attempts import Attempts, FailedError, connect_text, not_etcd
 from rce_master.store.etcd.exceptions import QUORUM, EtcdAwayError, EtcdRefusedError, NoQuorumError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Container, Sequence
     from types import TracebackType
 
     from rce.tls import Context
@@ -45,14 +45,6 @@ _UNCERTAIN = frozenset((_CANCELLED, _UNKNOWN, _DEADLINE, _INTERNAL, _UNAVAILABLE
 _BUSY = "too many requests"
 _ERROR = b'"error"'
 """What answers hold that tell of a fault; keys and values of records are in base64."""
-
-
-class _FailedError(Exception):
-    """One endpoint did not do a request; another one may."""
-
-    def __init__(self, reason: str, *, maybe_done: bool) -> None:
-        super().__init__(reason)
-        self.maybe_done = maybe_done
 
 
 class Watch:
@@ -109,8 +101,9 @@ class Watch:
 class EtcdClient:
     """Speaks with the members of one etcd cluster. An async context manager.
 
-    A member that fails is passed over, and the next one stays in use; calls that wait for the member that
-    failed ask the next one too. Cancelling a call leaves open whether it is done.
+    A member that fails or is late is passed over, and the next one stays in use; calls that wait for the
+    member that failed ask the next one too, and take the answer that comes first. Cancelling a call leaves
+    open whether it is done.
 
     Args:
         endpoints: Addresses ``HOST:PORT`` of members; the nearest one first.
@@ -171,7 +164,7 @@ class EtcdClient:
         answers = await asyncio.gather(*map(self._check_version, self._endpoints), return_exceptions=True)
         reasons = {}
         for number, error in enumerate(answers):
-            if isinstance(error, _FailedError):
+            if isinstance(error, FailedError):
                 reasons[number] = f"{self._endpoints[number]}: {error}"
             elif error is not None:
                 raise error
@@ -187,11 +180,16 @@ class EtcdClient:
             raise NoQuorumError(f"etcd has no quorum ({error}): {QUORUM}") from error
 
     async def _check_version(self, endpoint: str) -> None:
-        body = await self._exchange(endpoint, "version", None, self._attempt)
+        try:
+            async with asyncio.timeout(self._attempt):
+                body = await self._exchange(endpoint, "version", None)
+        except TimeoutError:
+            text = f"no answer within {self._attempt:.3g} s"
+            raise FailedError(text, maybe_done=False) from None
         try:
             version = wire.read_version(body)
         except wire.WireError:
-            raise _FailedError(
+            raise FailedError(
                 "this is not etcd; expected its address for clients, as a rule port 2379", maybe_done=False
             ) from None
         if version < MIN_VERSION:
@@ -361,30 +359,55 @@ class EtcdClient:
         read: Callable[[wire.Message], T],
         timeout: float | None = None,
     ) -> T:
-        """Ask the endpoints in turn, each once."""
-        reasons: list[str] = []
-        maybe_done = False
+        """Ask the endpoints in turn, each once, and return the first answer.
+
+        One that is late may still answer while the next one is asked: where all of them are far away, the
+        first request is the first that can be answered.
+        """
         body = json.dumps(message).encode()
         limit = (timeout or self._attempt) + len(body) / BYTES_PER_S
-        for _ in self._endpoints:
-            used = self._current
-            endpoint = self._endpoints[used]
-            try:
-                answer = await self._exchange(endpoint, path, body, limit, self._unanswered)
-                return read(json.loads(answer))
-            except (wire.WireError, ValueError) as error:
-                reasons.append(f"{endpoint}: {error}")
-                maybe_done = True
-            except _FailedError as error:
-                reasons.append(f"{endpoint}: {error}")
-                maybe_done = maybe_done or error.maybe_done
-            except EtcdRefusedError as error:
-                # A member that was asked before may have passed the same request on.
-                if not maybe_done:
-                    raise
-                raise EtcdAwayError([*reasons, str(error)], maybe_done=True) from error
-            self._pass_over(used)
-        raise EtcdAwayError(reasons, maybe_done=maybe_done)
+        reasons: dict[int, str] = {}
+        maybe_done = False
+        async with Attempts() as attempts:
+            while len(reasons) < len(self._endpoints):
+                used = self._next_of(reasons)
+                endpoint = self._endpoints[used]
+                late = asyncio.timeout(limit)
+                began = time.monotonic()
+                attempts.begin(used, self._exchange(endpoint, path, body, late))
+                try:
+                    async with late:
+                        self._unanswered.add(late)
+                        while used not in reasons:
+                            asked, answer = await attempts.next()
+                            try:
+                                return read(json.loads(answer.result()))
+                            except (wire.WireError, ValueError) as error:
+                                reasons[asked] = f"{self._endpoints[asked]}: {error}"
+                                maybe_done = True
+                            except FailedError as error:
+                                reasons[asked] = f"{self._endpoints[asked]}: {error}"
+                                maybe_done = maybe_done or error.maybe_done
+                            except EtcdRefusedError as error:
+                                # Another member may have passed the same request on, or be about to.
+                                if not maybe_done and not attempts.are_left:
+                                    raise
+                                told = [*reasons.values(), str(error)]
+                                raise EtcdAwayError(told, maybe_done=True) from error
+                except TimeoutError:
+                    waited = time.monotonic() - began
+                    reasons[used] = f"{endpoint}: no answer within {waited:.3g} s"
+                    maybe_done = True
+                finally:
+                    self._unanswered.discard(late)
+                self._pass_over(used)
+        raise EtcdAwayError([*reasons.values()], maybe_done=maybe_done)
+
+    def _next_of(self, asked: Container[int]) -> int:
+        """Return the first member, from the one in use on, that was not asked yet."""
+        count = len(self._endpoints)
+        order = ((self._current + step) % count for step in range(count))
+        return next(number for number in order if number not in asked)
 
     def _pass_over(self, used: int) -> None:
         """Use the next member, unless another call has done so, and let no call wait for this one."""
@@ -401,8 +424,7 @@ class EtcdClient:
         endpoint: str,
         path: str,
         body: bytes | None,
-        timeout: float,
-        unanswered: set[asyncio.Timeout] | None = None,
+        late: asyncio.Timeout | None = None,
     ) -> bytes:
         """Do one request at one endpoint.
 
@@ -410,64 +432,39 @@ class EtcdClient:
             endpoint: Its address.
             path: Of the request.
             body: What is posted; None: nothing, it is a ``GET``.
-            timeout: Seconds until it is given up.
-            unanswered: Holds the request's timeout until an answer begins.
+            late: Ends the wait for it; not for the reason that its member was passed over, once an answer
+                begins.
         """
         assert self._session is not None
         scheme = "http" if self._tls is None else "https"
-        limit = asyncio.timeout(timeout)
-        unanswered = set() if unanswered is None else unanswered
-        unanswered.add(limit)
-        began = time.monotonic()
         try:
-            async with (
-                limit,
-                self._session.request(
-                    "GET" if body is None else "POST",
-                    f"{scheme}://{endpoint}/{path}",
-                    data=None if body is None else io.BytesIO(body),  # aiohttp sends it in pieces
-                    timeout=aiohttp.ClientTimeout(total=None, sock_connect=self._attempt),
-                    ssl=True if self._tls is None else self._tls(),
-                    allow_redirects=False,
-                ) as response,
-            ):
-                unanswered.discard(limit)
+            async with self._session.request(
+                "GET" if body is None else "POST",
+                f"{scheme}://{endpoint}/{path}",
+                data=None if body is None else io.BytesIO(body),  # aiohttp sends it in pieces
+                timeout=aiohttp.ClientTimeout(total=None, sock_connect=self._attempt),
+                ssl=True if self._tls is None else self._tls(),
+                allow_redirects=False,
+            ) as response:
+                if late is not None:
+                    self._unanswered.discard(late)
                 status, answer = response.status, await response.read()
         except aiohttp.ClientConnectorError as error:
-            raise _FailedError(_connect_text(error), maybe_done=False) from error
+            raise FailedError(connect_text(error), maybe_done=False) from error
         except aiohttp.ConnectionTimeoutError:
-            raise _FailedError(f"no connection within {self._attempt:.3g} s", maybe_done=False) from None
-        except TimeoutError:
-            waited = time.monotonic() - began
-            raise _FailedError(f"no answer within {waited:.3g} s", maybe_done=True) from None
+            raise FailedError(f"no connection within {self._attempt:.3g} s", maybe_done=False) from None
         except (aiohttp.ClientError, OSError) as error:
             text = explain_to_client(error) or str(error) or type(error).__name__
             if self._tls is None and isinstance(error, aiohttp.ServerDisconnectedError):
                 text += " (if this etcd uses TLS, name it etcds://)"
-            raise _FailedError(text, maybe_done=True) from error
-        finally:
-            unanswered.discard(limit)
+            raise FailedError(text, maybe_done=True) from error
         if status == _OK and _ERROR not in answer:
             return answer
         fault = wire.read_fault(answer)
         if fault is None:
-            raise _FailedError(_not_etcd(status, answer, tls=self._tls is not None), maybe_done=False)
+            raise FailedError(not_etcd(status, answer, tls=self._tls is not None), maybe_done=False)
         if fault.code in _UNCERTAIN:
-            raise _FailedError(fault.text, maybe_done=True)
+            raise FailedError(fault.text, maybe_done=True)
         if fault.code == _EXHAUSTED and _BUSY in fault.text:
-            raise _FailedError(fault.text, maybe_done=False)
+            raise FailedError(fault.text, maybe_done=False)
         raise EtcdRefusedError(endpoint, fault)
-
-
-def _connect_text(error: aiohttp.ClientConnectorError) -> str:
-    if (explained := explain_to_client(error)) is not None:
-        return explained
-    number = error.os_error.errno or 0
-    # asyncio's own text leaves out why; numbers of failed look-ups are negative.
-    return os.strerror(number) if number > 0 else error.os_error.strerror or str(error.os_error)
-
-
-def _not_etcd(status: int, answer: bytes, *, tls: bool) -> str:
-    if not tls and b"HTTPS" in answer:
-        return "it uses TLS; name it etcds://"
-    return f"this is not etcd's gateway: it answered {status}"

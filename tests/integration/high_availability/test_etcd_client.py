@@ -219,6 +219,30 @@ async def test_a_call_that_left_a_member_may_be_done() -> None:
     assert caught.value.maybe_done
 
 
+async def test_a_late_answer_counts_while_the_next_member_is_asked() -> None:
+    """Where each member needs longer than one may take, etcd can still be used."""
+    asked = 0
+    both = asyncio.Event()
+
+    async def far_away(_: web.Request) -> web.Response:
+        nonlocal asked
+        asked += 1
+        number = asked
+        if number == 1:
+            await both.wait()
+            return web.json_response({**HEADER, "count": "1"})
+        both.set()
+        await asyncio.sleep(NEVER_S)
+        return web.json_response(HEADER)
+
+    async with contextlib.AsyncExitStack() as stack:
+        endpoints = [await stack.enter_async_context(served(far_away)) for _ in range(2)]
+        async with EtcdClient(endpoints, attempt=NEVER_S) as client, asyncio.timeout(PATIENT_S):
+            page = await client.range("/", timeout=0.1)
+            assert page.count == 1
+            assert client.in_use == endpoints[1]
+
+
 async def test_a_call_whose_answer_has_begun_stays() -> None:
     """A member that answers a page slowly is not asked in vain if a small request failed meanwhile."""
     may_end = asyncio.Event()
