@@ -27,6 +27,8 @@ REGISTERS = frozenset(f"{user}/{kind}" for user in REGISTER_USERS for kind in KI
 INITIAL = 1_000_000
 """Of all registers, which are limits of users."""
 TIMEOUT_S = 3.0
+CONNECT_S = 1.0
+"""Until a machine that accepts no connection is passed over; else times would be those of the clients."""
 PAUSE_S = 0.1
 LAST_ANSWERS = 20
 """Answers that are told if no write is acknowledged in time."""
@@ -74,7 +76,7 @@ class Clients:
     def session(self, timeout: float = TIMEOUT_S) -> aiohttp.ClientSession:
         """Return a session of the logged-in user."""
         headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
-        limit = aiohttp.ClientTimeout(total=timeout)
+        limit = aiohttp.ClientTimeout(total=timeout, sock_connect=CONNECT_S)
         return aiohttp.ClientSession(headers=headers, timeout=limit, middlewares=(_send_once,))
 
     async def _asked(self, method: str, url: str, body: object = None) -> dict[str, Any]:
@@ -201,8 +203,12 @@ class Clients:
                     self.session(PATIENCE_S) as session,
                     session.get(f"{self._url(used)}api/v1/events", headers=headers) as reply,
                 ):
+                    number = 0
                     async for line in reply.content:
-                        ids += [int(line[3:])] if line.startswith(b"id:") else []
+                        if line.startswith(b"id:"):
+                            number = int(line[3:])
+                        elif line.startswith(b"data:"):  # else it is the id after which the stream begins
+                            ids.append(number)
             await asyncio.sleep(PAUSE_S)
 
     async def _make_tokens(self, used: int) -> None:

@@ -31,6 +31,8 @@ PORTS = (ETCD_PORT, PEER_PORT, CONTROL_PORT, None)
 ALL = (("INPUT", "-i", "eth0"), ("OUTPUT", "-o", "eth0"))
 """Rules that cut a machine off from all others."""
 DELAY_S, LOSS = 0.2, 0.05
+DELAY_OF_ALL_S = 0.05
+"""Packets from one machine to another are delayed at both: a round trip takes four times as long."""
 SLOW_S = 8.0
 LOST_SHARE = 0.05
 LOST_WRITES, LONG_LOST_WRITES = 30, 500
@@ -159,32 +161,33 @@ async def flap(world: World) -> None:
 
 async def delay(world: World) -> None:
     """Delay and lose packets of one machine after the other, which moves no lead; then of all."""
-    fault = f"{DELAY_S * 1e3:g} ms and {LOSS:.0%}"
     machines = world.cluster.machines
     for machine in machines[:1] if world.scale == 1 else machines:
-        async with _delayed(world, machine), world.lead_stays(f"{fault} at one"):
+        what = f"{DELAY_S * 1e3:g} ms and {LOSS:.0%} at one"
+        async with _delayed(world, machine, DELAY_S), world.lead_stays(what):
             await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
             await world.clients.wait_for_writes()
     if world.scale == 1:
         return
     async with AsyncExitStack() as stack:
         for machine in machines:
-            await stack.enter_async_context(_delayed(world, machine))
+            await stack.enter_async_context(_delayed(world, machine, DELAY_OF_ALL_S))
         term = await world.term()
         await asyncio.sleep(LONG_SLOW_S)
         await world.clients.wait_for_writes()
-        world.times.add(f"terms begun under {fault} at all", await world.term() - term)
+        what = f"terms begun under {DELAY_OF_ALL_S * 1e3:g} ms and {LOSS:.0%} at all"
+        world.times.add(what, await world.term() - term)
 
 
 @asynccontextmanager
-async def _delayed(world: World, machine: Machine) -> AsyncIterator[None]:
-    """Delay and lose packets of a machine until it is left."""
+async def _delayed(world: World, machine: Machine, delay: float) -> AsyncIterator[None]:
+    """Delay each packet of a machine by so many seconds, and lose some, until it is left."""
     since = time.monotonic()
     seed = world.rng.randrange(1000)
-    async with slow(machine.place, seed, delay=DELAY_S, loss=LOSS, tag=machine.name):
+    async with slow(machine.place, seed, delay=delay, loss=LOSS, tag=machine.name):
         asked = time.monotonic()
         await machine.health()
-        assert time.monotonic() - asked > 2 * DELAY_S, f"packets of {machine.name} are not delayed"
+        assert time.monotonic() - asked > 2 * delay, f"packets of {machine.name} are not delayed"
         yield
     world.history.cuts.append((machine.name, since, time.monotonic()))
 
