@@ -31,7 +31,7 @@ PORTS = (ETCD_PORT, PEER_PORT, CONTROL_PORT, None)
 ALL = (("INPUT", "-i", "eth0"), ("OUTPUT", "-o", "eth0"))
 """Rules that cut a machine off from all others."""
 DELAY_S, LOSS = 0.2, 0.05
-DELAY_OF_ALL_S = 0.05
+DELAY_OF_ALL_S, LOSS_OF_ALL = 0.05, 0.01
 """Packets from one machine to another are delayed at both: a round trip takes four times as long."""
 SLOW_S = 8.0
 LOST_SHARE = 0.05
@@ -160,31 +160,35 @@ async def flap(world: World) -> None:
 
 
 async def delay(world: World) -> None:
-    """Delay and lose packets of one machine after the other, which moves no lead; then of all."""
+    """Delay and lose packets of one machine after the other, which moves no lead; then of all.
+
+    etcd's leader is on another one: two streams that each stall at every loss are slower than a lease lasts.
+    """
     machines = world.cluster.machines
     for machine in machines[:1] if world.scale == 1 else machines:
+        await lead_etcd(world, world.rng.choice([each for each in machines if each is not machine]))
         what = f"{DELAY_S * 1e3:g} ms and {LOSS:.0%} at one"
-        async with _delayed(world, machine, DELAY_S), world.lead_stays(what):
+        async with _delayed(world, machine, DELAY_S, LOSS), world.lead_stays(what):
             await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
             await world.clients.wait_for_writes()
     if world.scale == 1:
         return
     async with AsyncExitStack() as stack:
         for machine in machines:
-            await stack.enter_async_context(_delayed(world, machine, DELAY_OF_ALL_S))
+            await stack.enter_async_context(_delayed(world, machine, DELAY_OF_ALL_S, LOSS_OF_ALL))
         term = await world.term()
         await asyncio.sleep(LONG_SLOW_S)
         await world.clients.wait_for_writes()
-        what = f"terms begun under {DELAY_OF_ALL_S * 1e3:g} ms and {LOSS:.0%} at all"
+        what = f"terms begun under {DELAY_OF_ALL_S * 1e3:g} ms and {LOSS_OF_ALL:.0%} at all"
         world.times.add(what, await world.term() - term)
 
 
 @asynccontextmanager
-async def _delayed(world: World, machine: Machine, delay: float) -> AsyncIterator[None]:
-    """Delay each packet of a machine by so many seconds, and lose some, until it is left."""
+async def _delayed(world: World, machine: Machine, delay: float, loss: float) -> AsyncIterator[None]:
+    """Delay each packet of a machine by so many seconds, and lose a share, until it is left."""
     since = time.monotonic()
     seed = world.rng.randrange(1000)
-    async with slow(machine.place, seed, delay=delay, loss=LOSS, tag=machine.name):
+    async with slow(machine.place, seed, delay=delay, loss=loss, tag=machine.name):
         asked = time.monotonic()
         await machine.health()
         assert time.monotonic() - asked > 2 * delay, f"packets of {machine.name} are not delayed"
