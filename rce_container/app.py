@@ -115,6 +115,8 @@ class App:
 
     async def _run(self, quitting: Quitting, ready: Callable[[str, str], None]) -> None:
         identity = self.tls.for_task_sets()
+        if text := self.tls.plain_warning("", self.host):
+            _log.warning("%s", text)
         tls = None if identity is None else identity.client
         uids = UidPool(self.settings.first_uid, self.settings.uids)
         namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)

@@ -14,7 +14,6 @@ from rce.control import NODE_STATES, PATCHES, SNAPSHOTS, TYPED_REQUESTS
 from rce.control_channel.server import ControlServer
 from rce.guard import TrustedProxies
 from rce.own_process import listening
-from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
 from rce.tls.names import CertificateNames
 from rce.web.origin import ServerNames
@@ -288,10 +287,6 @@ class Master:
             term=0 if fence is None else fence.term,
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
-        if for_clients is None or for_task_sets is None:
-            what = "passwords travel" if for_clients is None else "what task sets tell each other travels"
-            if text := plain_warning(what, settings.bind):
-                _log.warning("%s", text)
         async with AsyncExitStack() as stack:
             try:
                 with listening(settings.bind, settings.control_port, "--control-port"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import logging
 import socket
 import sys
 
@@ -30,6 +31,8 @@ from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings
 from rce_master.settings import MasterSettings, state_settings
 from rce_master.store import SqliteStore
+
+_log = logging.getLogger(__name__)
 
 
 def run(engine: EngineSettings, *, verbose: bool = False) -> int:
@@ -88,6 +91,8 @@ def _settings(engine: EngineSettings) -> MasterSettings:
 
 async def _run(settings: MasterSettings, secret: Secret) -> None:
     """Run until SIGINT or SIGTERM."""
+    if text := settings.tls.plain_warning("passwords travel", settings.bind):
+        _log.warning("%s", text)
     task = asyncio.current_task()
     assert task is not None
     signals = EndSignals(task)

@@ -22,7 +22,7 @@ from rce.masters import Masters, split_addresses, split_port
 from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.tls.choice import TlsChoice, plain_warning
+from rce.tls.choice import TlsChoice
 from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool
 from rce_robot.doors.client.door import ClientDoor
@@ -104,9 +104,9 @@ class App:
             port: int = listener.getsockname()[1]
             scheme = "ws" if for_robots is None else "wss"
             url = settings.public_url or f"{scheme}://{in_url(reach)}:{port}/"
-            if for_robots is None and not url.startswith("wss:"):
-                _warn(plain_warning("robots' passwords and messages travel", settings.host))
-            elif for_robots is not None and not settings.public_url:
+            to_robots = "" if url.startswith("wss:") else "robots' passwords and messages travel"
+            _warn(self.tls.plain_warning(to_robots, settings.host))
+            if for_robots is not None and not settings.public_url:
                 _warn(name_warning(for_robots, reach))
             info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=machine_memory())
             lobby = Lobby(

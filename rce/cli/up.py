@@ -23,7 +23,7 @@ from rce.config import (
 )
 from rce.own_process import machine_memory
 from rce.supervision.plan import Plan, Program
-from rce.tls.choice import WARNED_VARIABLE, plain_warning
+from rce.tls.choice import WARNED_VARIABLE, TlsChoice
 
 OPTIONS = SettingsOptions(
     "dev", "state_dir", "secret_file", "log_level", "log_dir", "master", "robot", "container", "tls", up=True
@@ -121,11 +121,8 @@ def plan(settings: EngineSettings, replicas: int = 1) -> Plan:
 
 def warning(settings: EngineSettings) -> str | None:
     """Return the warnings for an engine that serves other machines without TLS."""
-    if settings.tls.enabled:
-        return None
-    return plain_warning(
-        "passwords and messages travel", settings.master.bind, settings.robot.bind, settings.container.bind
-    )
+    hosts = settings.master.bind, settings.robot.bind, settings.container.bind
+    return TlsChoice.of(settings).plain_warning("passwords and messages travel", *hosts)
 
 
 def programs(settings: EngineSettings, masters: Replicas | None = None) -> Iterable[Program]:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 ENGINE = "engine"
 """Name of the certificate that an engine's programs use by default."""
 FOLDER = "certificates"
+BETWEEN_TASK_SETS = "messages between task sets, and their secret, travel"
+"""What is sent in clear where only clients have TLS."""
 WARNED_VARIABLE = "RCE_TLS_WARNED"
 """Set for programs whose starter has warned already."""
 
@@ -88,6 +90,18 @@ class TlsChoice:
         identity = TlsIdentity(self._own())
         identity.client()
         return identity
+
+    def plain_warning(self, to_clients: str, *hosts: str) -> str | None:
+        """Return the warning of a program that serves other machines without TLS; None if it does not.
+
+        Args:
+            to_clients: The data that is sent in clear if clients have no TLS either; empty: none.
+            hosts: The addresses that it listens on.
+        """
+        if self.enabled:
+            return None
+        clients_too = to_clients and self.certificate is None
+        return plain_warning(to_clients if clients_too else BETWEEN_TASK_SETS, *hosts)
 
     def _own(self) -> TlsFiles:
         certificate, key = self.folder / f"{self.name}.pem", self.folder / f"{self.name}.key"

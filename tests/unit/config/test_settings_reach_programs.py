@@ -137,16 +137,23 @@ def test_one_address_for_all_programs(host: str) -> None:
 
 @pytest.mark.parametrize(
     ("host", "tls", "warns"),
-    [("0.0.0.0", False, True), ("127.0.0.1", False, False), ("0.0.0.0", True, False)],
+    [
+        ("0.0.0.0", TlsSettings(), "passwords and messages travel in clear"),
+        ("127.0.0.1", TlsSettings(), ""),
+        ("0.0.0.0", TlsSettings(enabled=True), ""),
+        ("0.0.0.0", TlsSettings(cert=Path("/public.pem")), "messages between task sets, and their secret,"),
+        ("127.0.0.1", TlsSettings(cert=Path("/public.pem")), ""),
+    ],
 )
 def test_one_warning_beyond_loopback_without_tls(
-    host: str, tls: bool, warns: bool, monkeypatch: pytest.MonkeyPatch
+    host: str, tls: TlsSettings, warns: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of ``rce up`` itself; its programs are told to be silent."""
     monkeypatch.delenv(WARNED_VARIABLE, raising=False)
-    settings = bound_to(host, EngineSettings(tls=TlsSettings(enabled=tls)))
+    settings = bound_to(host, EngineSettings(tls=tls))
     text = warning(settings)
-    assert (text is not None) == warns
+    assert (text is not None) == bool(warns)
+    assert (text or "").startswith(warns)
     assert "\n" not in (text or "")
     assert all(WARNED_VARIABLE in program.env for program in programs(settings))
 
