@@ -295,18 +295,26 @@ class LinkHub:
             self.limits, self.timeouts, on_open=self._carriers.add, on_closed=self._carriers.discard
         )
 
-    def _accept(self, received: bytes = b"", guest: Guest | None = None) -> SocketCarrier:
-        """Make the carrier of an accepted connection, which may have a place in the lobby already."""
+    def _accept(
+        self, received: bytes = b"", guest: Guest | None = None, until: float | None = None
+    ) -> SocketCarrier:
+        """Make the carrier of an accepted connection.
+
+        Args:
+            received: What was read of it already.
+            guest: Its place in the lobby, if it has one already.
+            until: When its HELLO must be there, by the loop's clock; None: as :class:`LinkTimeouts` says.
+        """
         return SocketCarrier(
             self.limits,
             self.timeouts,
             received=received,
             max_early=_MAX_EARLY,
-            on_open=partial(self._admit, former=guest),
+            on_open=partial(self._admit, former=guest, until=until),
             on_closed=self._carriers.discard,
         )
 
-    def _admit(self, carrier: SocketCarrier, former: Guest | None) -> None:
+    def _admit(self, carrier: SocketCarrier, former: Guest | None, until: float | None) -> None:
         """Wait for the HELLO of an accepted connection, if there is room."""
         self._carriers.add(carrier)
         if former is not None:
@@ -316,12 +324,16 @@ class LinkHub:
         if self._closed or guest is None:
             carrier.abort(crowded)
         else:
-            self._greetings.spawn(self._greet(carrier, guest), name="link greeting")
+            until = until or self._handshake_end()
+            self._greetings.spawn(self._greet(carrier, guest, until), name="link greeting")
 
-    async def _greet(self, carrier: SocketCarrier, guest: Guest) -> None:
+    def _handshake_end(self) -> float:
+        return self.loop.time() + self.timeouts.handshake
+
+    async def _greet(self, carrier: SocketCarrier, guest: Guest, until: float) -> None:
         """Shake hands as the accepting end."""
         try:
-            async with asyncio.timeout(self.timeouts.handshake):
+            async with asyncio.timeout_at(until):
                 hello = parse_hello(await carrier.handshake_frame())
                 link = await self._find(hello)
         except FormerPlaceError as error:
@@ -355,10 +367,11 @@ class LinkHub:
         if guest is None:
             sock.close()
             return
+        until = self._handshake_end()  # one limit for TLS and HELLO together
         try:
-            async with asyncio.timeout(self.timeouts.handshake):
+            async with asyncio.timeout_at(until):
                 link = await self._wait_for(link_id)
-                await accept_secure(sock, link.spec, partial(self._accept, guest=guest))
+                await accept_secure(sock, link.spec, partial(self._accept, guest=guest, until=until))
         except (LinkRefusedError, OSError) as error:
             sock.close()
             _log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")

@@ -17,7 +17,8 @@ class LinkTimeouts:
     connect: float = 5.0
     """To reach a peer's socket."""
     handshake: float = 10.0
-    """From an accepted connection to its HELLO, and from HELLO to the answer; more than ``unknown_link``."""
+    """From an accepted connection to its HELLO, with TLS; more than ``unknown_link``. It begins again where a
+    connection is handed over. The dialing end: to begin TLS, and then from HELLO to the answer."""
     unknown_link: float = 5.0
     """An accepted link that no endpoint knows yet: its spec may be on its way."""
     redial: Backoff = Backoff(first=0.02, longest=1.0, jitter=0.5)

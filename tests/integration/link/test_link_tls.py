@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import dataclasses
 import logging
 import os
+import socket
 import ssl
 from typing import TYPE_CHECKING
 
@@ -12,14 +15,20 @@ import pytest
 from msgspec.structs import replace
 
 from rce.control.model import LinkAddress, LinkSpec
-from rce.link import LinkHub
+from rce.link import LinkHub, LinkLimits
 from rce.link.encryption import _derive, accepting_context, dialing_context
 from rce.link.exceptions import LinkLostError, LinkRefusedError
 from rce.link.handshake import encode_hello, encode_secure
+from rce.link.link import Link
+from rce.link.secure import accept_secure
 
 from .conftest import TIMEOUTS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.link.socket_carrier import SocketCarrier
+
     from .conftest import Rig
 
 SECURE = pytest.mark.parametrize("way", ["secure", "handed-over-secure"])
@@ -109,6 +118,31 @@ async def test_plain_peer_with_the_token_is_refused(rig: Rig, way: str) -> None:
     answer = await asyncio.wait_for(reader.read(), 10)
     assert b"in TLS only" in answer
     writer.close()
+
+
+@SECURE
+async def test_silent_peer_has_one_time_for_tls_and_hello(
+    rig: Rig, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit that began again after TLS would be the long one."""
+    _, b = await rig.pair(way, handshake=0.5)
+    spec = LinkSpec(id="L", peer="u/a", token=TOKEN, dial=False, address=LinkAddress())
+    b.hub.register(Link(spec, LinkLimits()))
+
+    async def begin_tls(sock: socket.socket, spec: LinkSpec, make: Callable[[], SocketCarrier]) -> None:
+        b.hub.timeouts = dataclasses.replace(b.hub.timeouts, handshake=600.0)
+        await accept_secure(sock, spec, make)
+
+    monkeypatch.setattr("rce.link.hub.accept_secure", begin_tls)
+    sock = socket.create_connection(("127.0.0.1", b.address.port))
+    sock.sendall(encode_secure("L"))
+    sock.setblocking(False)
+    async with asyncio.timeout(20):
+        with contextlib.suppress(ConnectionError, ssl.SSLError):
+            tls = dialing_context(TOKEN)
+            reader, writer = await asyncio.open_connection(sock=sock, ssl=tls, server_hostname="")
+            with contextlib.closing(writer):
+                assert await reader.read() == b""
 
 
 async def test_hub_with_tls_does_not_dial_plain_peers(rig: Rig) -> None:
