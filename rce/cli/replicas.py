@@ -45,14 +45,15 @@ class Replicas:
     """Masters that share an etcd, all on this machine.
 
     Args:
-        settings: The engine's settings. Each master takes the ports of the former one plus one.
-        count: How many masters, and members of etcd.
+        settings: The engine's settings, with the number of masters, which is also that of members of etcd.
+            Each master takes the ports of the former one plus one.
 
     Raises:
         ReplicasError: They cannot be run like that.
     """
 
-    def __init__(self, settings: EngineSettings, count: int) -> None:
+    def __init__(self, settings: EngineSettings) -> None:
+        count = settings.master.replicas
         if count not in COUNTS:
             why = " Two masters survive no failure: one of them is not more than half." if count == 2 else ""  # noqa: PLR2004
             raise ReplicasError(f"--replicas must be {' or '.join(map(str, COUNTS))}, found {count}.{why}")

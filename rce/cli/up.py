@@ -52,14 +52,10 @@ def up(
     bind: Annotated[
         str | None, typer.Option(metavar="HOST", help="Address that all programs listen on.")
     ] = None,
-    replicas: Annotated[
-        int,
-        typer.Option(metavar="N", help="Run 3 or 5 masters and their etcd, to try how one fails."),
-    ] = 1,
 ) -> None:
     """Run an engine: master, robot and container task sets."""
     try:
-        plan(settings if bind is None else bound_to(bind, settings), replicas).hand_over()
+        plan(settings if bind is None else bound_to(bind, settings)).hand_over()
     except ReplicasError as error:
         raise typer.BadParameter(str(error)) from None
     except OSError as error:
@@ -85,12 +81,11 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
     )
 
 
-def plan(settings: EngineSettings, replicas: int = 1) -> Plan:
+def plan(settings: EngineSettings) -> Plan:
     """Return the programs to run and the lines to print.
 
     Args:
         settings: The engine's settings.
-        replicas: How many masters; several keep the state in an etcd, which is run too.
 
     Raises:
         ReplicasError: So many masters cannot be run.
@@ -101,7 +96,7 @@ def plan(settings: EngineSettings, replicas: int = 1) -> Plan:
             "rce up keeps the state on this machine; for a state in etcd start rce-master, rce-robot and"
             " rce-container by themselves (docs/how-to/three-masters.md)"
         )
-    masters = None if replicas == 1 else Replicas(settings, replicas)
+    masters = None if settings.master.replicas == 1 else Replicas(settings)
     ready = [f"RCE ready: {settings.http_url if masters is None else masters.http_urls}"]
     certified = {}
     if settings.tls.enabled:

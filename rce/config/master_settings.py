@@ -15,6 +15,14 @@ ANYWHERE = "0.0.0.0"  # noqa: S104 - an engine serves other machines unless in d
 class MasterSettings(Section, frozen=True, kw_only=True):
     """The Master Task Set, `rce-master`."""
 
+    replicas: Annotated[
+        int,
+        Setting(
+            "Masters of `rce up`: 3 or 5 share an etcd, which is run too, to try how one fails.",
+            option="",
+            up="replicas",
+        ),
+    ] = 1
     bind: Annotated[Host, Setting("Address to listen on.")] = ANYWHERE
     http_port: Annotated[Port, Setting("Port of clients, REST API and metrics.", up="http-port")] = 9000
     control_port: Annotated[Port, Setting("Port of task sets.", up="control-port")] = 8080

@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from msgspec.structs import replace
 
 from rce.cli.replicas import Replicas, ReplicasError
 from rce.cli.up import plan
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce.supervision.plan import Program
+
+THREE = MasterSettings(replicas=3)
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +43,7 @@ def options_of(program: Program) -> dict[str, str]:
 
 
 def test_members_of_etcd_come_first_and_each_master_asks_its_own(tmp_path: Path) -> None:
-    made = plan(EngineSettings(state_dir=tmp_path, log_dir=tmp_path / "log"), 3)
+    made = plan(EngineSettings(state_dir=tmp_path, log_dir=tmp_path / "log", master=THREE))
     programs = {program.name: program for program in made.programs}
     members, masters = ["etcd-m1", "etcd-m2", "etcd-m3"], ["master1", "master2", "master3"]
     assert list(programs) == [*members, *masters, "robot", "container"]
@@ -67,19 +70,19 @@ def test_old_etcd_is_refused(etcd: Path, tmp_path: Path) -> None:
     """It would end by an option that it does not know, and be started again and again."""
     etcd.write_text("#!/bin/sh\necho 'etcd Version: 3.3.25'\n")
     with pytest.raises(ReplicasError, match=r"is version 3\.3; version 3\.4 or later is needed"):
-        plan(EngineSettings(state_dir=tmp_path), 3)
+        plan(EngineSettings(state_dir=tmp_path, master=THREE))
 
 
 def test_ports_stay_and_the_number_of_members_too(tmp_path: Path) -> None:
-    settings = EngineSettings(state_dir=tmp_path)
-    first = [options_of(program) for program in plan(settings, 3).programs[:3]]
-    assert [options_of(program) for program in plan(settings, 3).programs[:3]] == first
+    settings = EngineSettings(state_dir=tmp_path, master=THREE)
+    first = [options_of(program) for program in plan(settings).programs[:3]]
+    assert [options_of(program) for program in plan(settings).programs[:3]] == first
     with pytest.raises(ReplicasError, match="data of 3 members of etcd: give --replicas 3, or another"):
-        plan(settings, 5)
+        plan(replace(settings, master=MasterSettings(replicas=5)))
 
 
 def test_with_tls_etcd_asks_for_certificates(tmp_path: Path) -> None:
-    made = plan(EngineSettings(state_dir=tmp_path, tls=TlsSettings(enabled=True)), 3)
+    made = plan(EngineSettings(state_dir=tmp_path, master=THREE, tls=TlsSettings(enabled=True)))
     member, master = made.programs[0], made.programs[3]
     options = options_of(member)
     assert options["--listen-client-urls"].startswith("https://127.0.0.1:")
@@ -92,31 +95,31 @@ def test_with_tls_etcd_asks_for_certificates(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [0, 2, 4, 7])
 def test_only_numbers_that_survive_a_failure_are_taken(tmp_path: Path, count: int) -> None:
     with pytest.raises(ReplicasError, match=f"must be 3 or 5, found {count}"):
-        Replicas(EngineSettings(state_dir=tmp_path), count)
+        Replicas(EngineSettings(state_dir=tmp_path, master=MasterSettings(replicas=count)))
     assert not (tmp_path / "etcd").exists()
 
 
 @pytest.mark.parametrize(
     ("master", "why"),
     [
-        (MasterSettings(http_port=0), "known ports"),
-        (MasterSettings(control_port=0), "known ports"),
-        (MasterSettings(store="sqlite:/x"), "an etcd of its own"),
+        (MasterSettings(replicas=3, http_port=0), "known ports"),
+        (MasterSettings(replicas=3, control_port=0), "known ports"),
+        (MasterSettings(replicas=3, store="sqlite:/x"), "an etcd of its own"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(tmp_path: Path, master: MasterSettings, why: str) -> None:
     with pytest.raises(ReplicasError, match=why):
-        plan(EngineSettings(state_dir=tmp_path, master=master), 3)
+        plan(EngineSettings(state_dir=tmp_path, master=master))
 
 
 def test_missing_etcd_is_named(etcd: Path, tmp_path: Path) -> None:
     etcd.unlink()
     with pytest.raises(ReplicasError, match="etcd is not installed"):
-        Replicas(EngineSettings(state_dir=tmp_path), 3)
+        Replicas(EngineSettings(state_dir=tmp_path, master=THREE))
 
 
 def test_bad_ports_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "etcd").mkdir()
     (tmp_path / "etcd" / "ports.json").write_text("[1, 2")
     with pytest.raises(ReplicasError, match=r"ports\.json cannot be used"):
-        Replicas(EngineSettings(state_dir=tmp_path), 3)
+        Replicas(EngineSettings(state_dir=tmp_path, master=THREE))

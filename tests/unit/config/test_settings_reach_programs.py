@@ -165,7 +165,7 @@ def test_bad_address_is_refused() -> None:
 
 def test_every_setting_is_an_option_of_its_program() -> None:
     given = {option.place for options, _ in APPS.values() for option in options.options}
-    elsewhere = {("", "state_dir"), ("", "master_host"), ("robot", "count")}
+    elsewhere = {("", "state_dir"), ("", "master_host"), ("robot", "count"), ("master", "replicas")}
     for section, kind in {"": EngineSettings, **sections_of(EngineSettings)}.items():
         for name in fields_of(kind):
             assert (section, name) in given | elsewhere
