@@ -21,10 +21,3 @@ def test_reference_pages_are_current() -> None:
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr
-
-
-@pytest.mark.parametrize("page", ["settings.md", "options.md"])
-def test_pages_name_every_setting(page: str) -> None:
-    text = (ROOT / "docs/reference" / page).read_text()
-    assert "container.home_size" in text or "--home-size" in text
-    assert "| `--bind` |" in text
