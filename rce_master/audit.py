@@ -309,11 +309,19 @@ def choose(records: Iterable[Record], since: int, limit: int, user: str = "") ->
 def newest(folder: Path, files: int = FILES) -> list[Record]:
     """Read the newest records of a log's files, oldest first."""
     found: list[Record] = []
-    for number in range(files):
-        found = [*_read(_numbered(folder, number)), *found]
+    for file in log_files(folder, files):
+        found = [*_read(file), *found]
         if len(found) >= KEPT:
             break
     return found[-KEPT:]
+
+
+def log_files(folder: Path, files: int = FILES) -> Iterator[Path]:
+    """Return the possible files of a log, newest first.
+
+    A file that is put aside while they are read in this order comes again, and none is left out.
+    """
+    return (_numbered(folder, number) for number in range(files))
 
 
 def _is_due(since: float, now: float) -> bool:

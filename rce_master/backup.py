@@ -29,6 +29,7 @@ from typing import IO, Any, TypeAlias
 import msgspec
 
 from rce import __version__
+from rce_master.audit import AUDIT, log_files
 from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ARCHIVES
 from rce_master.snapshots.service import SNAPSHOTS
@@ -203,6 +204,8 @@ def _write_again(folders: Mapping[str, Path], out: IO[bytes], export: Export) ->
 def _write(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
     hashes: dict[str, str] = {}
     size = 0
+    logs: set[tuple[int, int]] = set()
+    """The files of the audit log that are in the copy, by device and inode."""
     with (
         export() as store,
         tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar,
@@ -211,6 +214,11 @@ def _write(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
         for name, path in _files(folders, store):
             try:
                 with path.open("rb") as source:
+                    if name.startswith(f"{MASTER}/{AUDIT}/"):
+                        status = os.fstat(source.fileno())
+                        if (status.st_dev, status.st_ino) in logs:
+                            continue  # it was put aside meanwhile, and is in the copy by its former name
+                        logs.add((status.st_dev, status.st_ino))
                     size += _add(tar, name, source, hashes)
             except FileNotFoundError as error:
                 if path.parent.name == ARCHIVES:
@@ -296,6 +304,9 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
     master = folders[MASTER]
     for sha256 in sorted({package.sha256 for package in packages_in(store)}):
         yield f"{MASTER}/{ARCHIVES}/{sha256}", master / ARCHIVES / sha256
+    logs = list(log_files(master / AUDIT))
+    for log in logs:
+        yield f"{MASTER}/{AUDIT}/{log.name}", log
     certificates = folders.get(CERTIFICATES)
     for part, folder in folders.items():
         for path in sorted(folder.rglob("*")):
@@ -303,6 +314,7 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
             left_out = part == MASTER and (
                 inside.parts[0] in _LEFT_OUT
                 or inside.parts[0].startswith(_OF_ETCD)
+                or path in logs
                 or (certificates is not None and path.is_relative_to(certificates))
             )
             if path.is_file() and not path.is_symlink() and not left_out:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tarfile
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import pytest
 
 from rce_master import backup
+from rce_master.audit import AUDIT, AuditLog, newest
 from rce_master.backup import CERTIFICATES, MASTER, BackupError, back_up, restore
 from rce_master.exceptions import StoreError
 from rce_master.snapshots.service import SNAPSHOTS
@@ -29,6 +30,34 @@ async def test_files_of_users_are_left_out(tmp_path: Path) -> None:
         names = copy.getnames()
     assert f"{MASTER}/audit.log" in names
     assert not [name for name in names if SNAPSHOTS in name]
+
+
+async def test_audit_log_that_rotates_meanwhile_is_copied_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "state"
+    await (await SqliteStore.open(folder)).close()
+    log = AuditLog(folder / AUDIT, lambda: 1.0)
+    for subject in ("first", "second", "third"):
+        if subject != "first":
+            log._turn()
+        log.add("alice", "log_in", subject)
+    (folder / AUDIT / "notes.txt").write_text("of an operator")
+    add = backup._add
+
+    def add_and_rotate(tar: tarfile.TarFile, name: str, source: IO[bytes], hashes: dict[str, str]) -> int:
+        size = add(tar, name, source, hashes)
+        if name.endswith("audit.jsonl"):
+            log._turn()
+        return size
+
+    monkeypatch.setattr(backup, "_add", add_and_rotate)
+    back_up({MASTER: folder}, tmp_path / "copy.tar")
+    log.close()
+    restore(tmp_path / "copy.tar", {MASTER: tmp_path / "restored"})
+    kept = tmp_path / "restored" / AUDIT
+    assert [one.subject for one in newest(kept)] == ["first", "second", "third"]
+    assert (kept / "notes.txt").exists()
 
 
 async def test_a_member_of_etcd_is_left_out(tmp_path: Path) -> None:
