@@ -223,8 +223,12 @@ def new_secret(file: Path) -> Secret:
         raise SecretError(f"cannot make the folder {file.parent}: {error.strerror}") from error
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w", encoding="ascii") as output:
-            output.write(secret.reveal() + "\n")
+        try:
+            with os.fdopen(descriptor, "w", encoding="ascii") as output:
+                output.write(secret.reveal() + "\n")
+        except OSError:
+            file.unlink()  # an empty file would count as a secret that is there already
+            raise
     except FileExistsError:
         raise SecretError(
             f"{file} is there already; programs that use it would not know another one. Remove it first"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -126,6 +127,20 @@ def test_new_secret_is_private_and_never_replaces_another(tmp_path: Path) -> Non
     with pytest.raises(SecretError, match="cannot make the folder"):
         new_secret(file / "below")
     assert read_secret(file) == made
+
+
+def test_new_secret_on_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
+    """A limit of the file's size stands for the disk."""
+    file = tmp_path / "secret"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(SecretError, match="cannot make the secret"):
+            new_secret(file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not file.exists()
+    assert new_secret(file) == read_secret(file)
 
 
 def test_secret_file_for_everybody_is_refused(tmp_path: Path) -> None:
