@@ -20,9 +20,10 @@ def folder() -> Iterator[Path]:
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def shared_engine() -> AsyncIterator[World]:
+async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[World]:
+    public = getattr(request.module, "PUBLIC_CERTIFICATE", False)
     with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as folder:
-        found = World(Path(folder))
+        found = World(Path(folder), public=public)
         await found.start()
         try:
             yield found

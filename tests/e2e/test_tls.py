@@ -1,4 +1,8 @@
-"""An engine with ``rce up --tls``, seen by programs that are not of its making: curl, openssl, aiohttp."""
+"""An engine with ``rce up --tls``, seen by programs that are not of its making: curl, openssl, aiohttp.
+
+Clients get the certificate of a second authority, as of a public one. With the engine's own one for them too:
+``test_tls_certificates.py``.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from pathlib import Path
 import pytest
 from support.engine import until
 from support.ports import free_ports
-from support.tls_engine import BIN, T, World, await_message, frame, in_world, make_echo, stranger
+from support.tls_engine import BIN, PUBLIC, T, World, await_message, frame, in_world, make_echo, stranger
 
 from rce.ros.core import Core
 from rce.tls.folder import CertificateFolder
@@ -23,6 +27,9 @@ from rce_client.exceptions import RefusedError
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("curl", "openssl")]
 
+PUBLIC_CERTIFICATE = True
+"""For the fixture ``world``."""
+
 
 @in_world
 async def test_curl_with_the_authority_is_served(world: World) -> None:
@@ -30,6 +37,24 @@ async def test_curl_with_the_authority_is_served(world: World) -> None:
         "--cacert", world.authority, f"{world.url}?userID=testUser&version=20130902"
     )
     assert (code, json.loads(text)) == (0, {"url": f"wss://127.0.0.1:{world.robots}/"})
+
+
+@in_world
+async def test_certificates_for_clients_and_task_sets_differ(world: World) -> None:
+    """A replaced file is used at once for clients."""
+    control = f"https://127.0.0.1:{world.control}/"
+    code, text = await world.curl("--cacert", world.certificates.authority, control)
+    assert code == 56, text
+    assert "certificate required" in text
+    code, text = await world.curl("--cacert", world.authority, control)
+    assert code == 60, text
+    file = world.for_clients.certificate(PUBLIC)
+    for renewal in range(2):
+        for port in (world.http, world.robots):
+            place = ("127.0.0.1", port)
+            shown = await asyncio.to_thread(ssl.get_server_certificate, place, ca_certs=world.authority)
+            assert shown.strip() in file.read_text(), f"port {port} after {renewal} renewals"
+        world.for_clients.issue(PUBLIC)
 
 
 @in_world
@@ -160,7 +185,7 @@ async def test_station_serves_its_page_in_tls(world: World) -> None:
 
         async def answers() -> bool:
             assert process.returncode is None
-            code, text = await world.curl("--cacert", world.authority, url)
+            code, text = await world.curl("--cacert", world.certificates.authority, url)
             return code == 0 and "<html" in text
 
         await until(answers, timeout=60, what="the station's page")

@@ -34,17 +34,27 @@ START_S = 120.0
 STRING = "std_msgs/String"
 
 
+PUBLIC = "public"
+"""Name of the certificate of the other authority."""
+
+
 in_world = pytest.mark.asyncio(loop_scope="module")
 
 
 class World:
-    """``rce up --dev --tls``, and what its files and ports are."""
+    """``rce up --dev --tls``, and what its files and ports are.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: Of its files.
+        public: Clients get the certificate of another authority, which stands for a public one.
+    """
+
+    def __init__(self, folder: Path, *, public: bool = False) -> None:
         self.folder = folder
         self.http, self.control, self.robots, *self.links = free_ports(5)
         self.log = folder / "log"
         self.certificates = CertificateFolder(folder / "state" / "certificates")
+        self.for_clients = CertificateFolder(folder / "public") if public else self.certificates
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
         self.env = kept | {"XDG_RUNTIME_DIR": str(folder), "RCE_LOGIN_FILE": str(folder / "login")}
         self.process: asyncio.subprocess.Process | None = None
@@ -55,7 +65,8 @@ class World:
 
     @property
     def authority(self) -> str:
-        return str(self.certificates.authority)
+        """The authority that clients trust."""
+        return str(self.for_clients.authority)
 
     def trusting(self) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=self.authority)
@@ -72,6 +83,11 @@ class World:
             "container-link-port": self.links[1],
         }
         options = [text for name, port in ports.items() for text in (f"--{name}", str(port))]
+        if self.for_clients is not self.certificates:
+            self.for_clients.make_authority()
+            self.for_clients.issue(PUBLIC, ("127.0.0.1",))
+            files = {"cert": self.for_clients.certificate(PUBLIC), "key": self.for_clients.key(PUBLIC)}
+            options += [text for name, file in files.items() for text in (f"--tls-{name}", str(file))]
         state = ["--state-dir", str(self.folder / "state"), "--runtime", "process", "--no-offer-images"]
         with self.log.open("ab") as log:
             self.process = await asyncio.create_subprocess_exec(
