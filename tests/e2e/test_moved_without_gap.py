@@ -5,18 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import urllib.error
 import urllib.request
 from collections import Counter
+from pathlib import Path
 
 import pytest
-from support.engine import Engine, running_engine, until
+from support.engine import Engine, Program, running_engine, until
+from support.ports import free_port
 
 from rce_client import Connection
 from rce_client.exceptions import CallError, NotConnectedError
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
+UPGRADE = Path(__file__).parents[2] / "docs/how-to/upgrade.md"
 WAIT_S = 120.0
 PERIOD_S = 0.02
 INTERFACES = {
@@ -148,8 +152,46 @@ async def change_place(engine: Engine, traffic: Traffic, how: str) -> None:
         request(engine, "DELETE", f"/machines/{here}/drain")
 
 
+def names(engine: Engine, machine: str) -> dict[str, int]:
+    """The container task sets of a machine, with the number of their containers."""
+    found = engine.get("/api/v1/machines")["machines"]
+    return {
+        one["process"]: one["endpoints"]
+        for one in found
+        if (one["kind"], one["machine"]) == ("container", machine)
+    }
+
+
+def beside(engine: Engine, old: Program) -> Program:
+    """Return the task set that the how-to starts beside an old one on the same machine."""
+    (options,) = re.findall(r"^rce-container MASTER (.*?) +#", UPGRADE.read_text(), re.MULTILINE)
+    words = options.replace("/var/lib/rce", str(engine.folder)).replace("10032", str(free_port())).split()
+    assert {"--state-dir", "--link-port", "--first-uid"} <= set(words)
+    return Program(f"{old.name}-new", [*old.argv, *words], engine.env, engine.folder)
+
+
+async def replace_task_set(engine: Engine, traffic: Traffic) -> None:
+    """Move the container to a new task set of its machine, and end the old one, as the how-to says."""
+    here, _ = place(engine)
+    (there,) = machines(engine) - {here}
+    request(engine, "PUT", f"/machines/{there}/drain")  # so that the new one is the only place
+    ((old_name, _),) = names(engine, here).items()
+    (old,) = (one for one in engine.machines if one.name == here)
+    new = beside(engine, old)
+    engine.machines.append(new)
+    await new.start()
+    await until(lambda: len(names(engine, here)) == 2, timeout=WAIT_S, what="both are there")
+    (new_name,) = names(engine, here).keys() - {old_name}
+    request(engine, "PUT", f"/machines/{old_name}/drain")
+    moved = {old_name: 0, new_name: 1}
+    await until(lambda: names(engine, here) == moved, timeout=WAIT_S, what="the container is at the new one")
+    await traffic.flows()
+    assert await old.stop() == 0
+    await traffic.flows()
+
+
 async def test_moves_and_drains_lose_no_call_and_no_message() -> None:
-    """The container is moved twice, and both its machines are drained."""
+    """The container is moved twice, its machines are drained, and its task set makes way for a new one."""
     async with (
         running_engine(machines=2) as engine,
         Connection(engine.url, "testUser", "testUser", "robot") as robot,
@@ -162,6 +204,7 @@ async def test_moves_and_drains_lose_no_call_and_no_message() -> None:
             for how in ("move", "move", "drain", "drain"):
                 await traffic.flows()
                 await change_place(engine, traffic, how)
+            await replace_task_set(engine, traffic)
             traffic.end()
             await running
         finally:
