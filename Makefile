@@ -4,13 +4,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 LOOPS  := $(VENV)/.compiled
+DIST   := dist
 
 PARALLEL := -n auto --dist loadgroup --durations=25
 
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help packages install demo test test-all collect test-quick fuzz faults lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all collect test-quick fuzz faults wheel lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -22,6 +23,7 @@ help:
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make docs    the documentation as a site, in build/docs; needs no network"
 	@echo "make reference  the pages of settings, options and life cycles"
+	@echo "make wheel   dist/rce-VERSION-py3-none-any.whl, which other machines install without a checkout"
 	@echo "make install only the set-up      make clean    remove what make made"
 
 install: $(STAMP) $(LOOPS)
@@ -61,6 +63,11 @@ faults: install
 
 test-quick: install
 	$(BIN)/python -m pytest -n logical -m "not slow" --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)
+
+# For machines without a checkout; needs no network.
+wheel: packages
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation \
+		--wheel-dir $(DIST) .
 
 lint: packages
 	$(BIN)/ruff check .
