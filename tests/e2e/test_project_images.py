@@ -109,12 +109,36 @@ def run(*options: str) -> list[str]:
     return [*_APART, _HIDE, "sh", *_RUN, *_LIMITS, *options]
 
 
-async def test_robot_image_works_with_engine_image(images: dict[str, str], tmp_path: Path) -> None:
-    """A message goes from a ROS graph through the robot's image and the engine's, and back."""
+@pytest.fixture
+def volume() -> Iterator[str]:
+    """The name of a volume, which is removed at the end."""
+    name = f"rce-state-{os.getpid()}-{secrets.token_hex(4)}"
+    yield name
+    podman("volume", "rm", "--force", name)
+
+
+def run_once(*argv: str, text: str = "") -> None:
+    done = subprocess.run(argv, input=text, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+async def test_robot_image_works_with_engine_image(
+    images: dict[str, str], volume: str, tmp_path: Path
+) -> None:
+    """A message goes from a ROS graph through the robot's image and the engine's, and back.
+
+    The engine is set up as its page says: with a secret's file, a first user, and a volume that is backed up.
+    """
     names = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
     core_port, *ports = free_ports(1 + len(names))
     options = [word for name, port in zip(names, ports, strict=True) for word in (name, str(port))]
-    up = ["rce", "up", "--dev", "--state-dir", "/var/lib/rce", "--runtime", "process", *options]
+    state = ("--state-dir", "/var/lib/rce")
+    up = ["rce", "up", "--bind", "127.0.0.1", *state, "--runtime", "process", *options]
+    secret, kept = tmp_path / "secret", f"--volume={volume}:/var/lib/rce"
+    run_once(str(BIN / "rce"), "secret", "new", str(secret))
+    add_user = ("rce", "user", "add", "testUser", "--admin", "--password-stdin", *state)
+    run_once(*run("--interactive", kept, images["engine"], *add_user), text="testUser")
+    shown = (f"--volume={secret}:/run/secrets/rce:ro", "--env", "RCE_SECRET_FILE=/run/secrets/rce")
     config = tmp_path / "robot.config"
     text = (ROOT / "configs/test.config").read_text()
     config.write_text(text.replace("http://localhost:9000/", f"http://127.0.0.1:{ports[0]}/"))
@@ -124,7 +148,8 @@ async def test_robot_image_works_with_engine_image(images: dict[str, str], tmp_p
     env = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
     env |= {"ROS_MASTER_URI": uri, "HOME": str(tmp_path)}
     core = Program("core", [str(BIN / "rce"), "core", "--port", str(core_port)], env, tmp_path)
-    engine = Program("engine", run(images["engine"], *up), dict(os.environ), tmp_path)
+    started = run("--name", volume, kept, *shown, images["engine"], *up)
+    engine = Program("engine", started, dict(os.environ), tmp_path)
     mount = f"--volume={config}:/robot.config:ro"
     robot = Program(
         "robot", run("--env", f"ROS_MASTER_URI={uri}", mount, images["robot"]), dict(os.environ), tmp_path
@@ -140,6 +165,8 @@ async def test_robot_image_works_with_engine_image(images: dict[str, str], tmp_p
         )
         output, _ = await asking.communicate()
         assert output.decode().strip() == "answer: hello", robot.output()
+        backup = ("rce", "backup", "/var/lib/rce/backup.tar", *state)
+        run_once(*_APART, _HIDE, "sh", "podman", "exec", volume, *backup)
         assert await robot.stop() == 0, robot.output()
         assert await engine.stop() == 0, engine.output()
     finally:
