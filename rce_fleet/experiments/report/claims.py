@@ -288,7 +288,7 @@ CLAIMS = (
         (Above(CLIENT_CPU, MMS, SMS), Above(CLIENT_CPU, CRS, SMS)),
         explanations.explain_client,
         also=(RATE, CLIENT_COST),
-        like_paper=_LASER,
+        like_paper=_LASER | {"client_cpu": "all"},  # a full client's CPU is limited, to the same in all
     ),
     Claim(
         "d",
@@ -337,7 +337,10 @@ CLAIMS = (
         "isolation",
         (
             Between(explanations.OTHERS, SMS, 1, float("inf"), "SMS shows topics of others"),
-            Above(explanations.OTHERS, SMS, MMS),
+            *(
+                Between(explanations.OTHERS, system, 0, 0, f"{system_label(system)} shows none of others")
+                for system in (MMS, CRS)
+            ),
         ),
         explanations.explain_counts,
         also=(explanations.VISIBLE,),

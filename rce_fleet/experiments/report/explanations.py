@@ -29,6 +29,7 @@ ROUND_TRIP = Quantity("round_trip")
 VISIBLE = Quantity("topics_visible")
 OTHERS = Quantity("topics_others")
 TOPICS, SERVICES, NEW_TOPICS = (Quantity(f"{what}_stopped") for what in ("topics", "services", "new_topics"))
+LIMITED = "With client_cpu=full, it is limited to the same share of a core in all systems."
 DOMINANT = 2.0
 """One of two causes makes the difference if its part is so much larger than the other one's."""
 
@@ -41,8 +42,9 @@ def explain_network(cases: Sequence[Case], reference: Case) -> str:
 
 def explain_client(cases: Sequence[Case], reference: Case) -> str:
     """Say whether the rate or the cost of a message makes the difference in machine 2's CPU."""
-    del cases
-    return _cause(reference, CLIENT_CPU, RATE, CLIENT_COST)
+    limited = any(("client_cpu", "full") in case.factors for case in cases)
+    texts = (LIMITED if limited else "", _cause(reference, CLIENT_CPU, RATE, CLIENT_COST))
+    return " ".join(filter(None, texts))
 
 
 def explain_server(cases: Sequence[Case], reference: Case) -> str:

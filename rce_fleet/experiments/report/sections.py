@@ -133,6 +133,8 @@ SECTIONS = (
         "Counted from one robot: topics, nodes and parameters of another robot that it sees, the most of two "
         "looks 2 s apart, as what is shared may come late, and whether "
         "it can publish to it, call its service, end its nodes and call its core (1) or not (0). "
+        "A run begins when the scans of both robots, which are shared, are heard on machine 1 (CRS: in the "
+        "robots' containers). "
         "`files_to_add` and `lines_to_add` are what has to be written for one more robot.",
         (
             TableSpec(

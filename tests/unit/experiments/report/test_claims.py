@@ -159,6 +159,24 @@ def test_reason_says_that_each_message_costs_more() -> None:
     assert "`client.cpu / rate`: SMS 100, MMS 200, CRS 250 ms." in found.reason
 
 
+def test_client_cpu_is_shown_where_it_is_not_limited() -> None:
+    """All systems use the same where the client is full: that figure says nothing of them."""
+    free = {**PAPER, "client_cpu": "all"}
+    rows = [
+        *in_three_systems("laser", "client.cpu", "cores", (0.02, 0.04, 0.08), free),
+        *in_three_systems("laser", "client.cpu", "cores", (0.2, 0.2, 0.2), PAPER),
+        *in_three_systems("laser", "rate", "Hz", EQUAL, free),
+        *in_three_systems("laser", "rate", "Hz", EQUAL, PAPER),
+    ]
+    found = judged("c", rows)
+    assert found.verdict is DEPENDS
+    assert found.reference is not None
+    assert dict(found.reference.factors) == {name: str(value) for name, value in free.items()}
+    limited = "With client_cpu=full, it is limited to the same share of a core in all systems."
+    assert limited in found.reason
+    assert limited not in judged("c", rows[:9] + rows[18:27]).reason
+
+
 @pytest.mark.parametrize(
     ("medians", "verdict"),
     [((7.5, 4.5, 4.0), HOLDS), ((7.5, 7.4, 7.3), FAILS), ((15.0, 4.5, 4.0), FAILS)],
@@ -242,9 +260,18 @@ def test_images_network_and_cpu() -> None:
     assert judged("f", raw_only).reason.startswith("Depends on encoding: holds with raw, not with png.")
 
 
-@pytest.mark.parametrize(("others", "verdict"), [((8, 2, 0), HOLDS), ((8, 8, 0), FAILS), ((0, 0, 0), FAILS)])
+@pytest.mark.parametrize(
+    ("others", "verdict"),
+    [
+        ((2, 0, 0), HOLDS),
+        ((2, 1, 0), FAILS),
+        ((2, 0, 1), FAILS),
+        ((8, 8, 0), FAILS),
+        ((0, 0, 0), FAILS),
+    ],
+)
 def test_visible_topics_need_one_run(others: Medians, verdict: Verdict) -> None:
-    """They are counted, not measured."""
+    """They are counted, not measured. One topic that is not shared and is seen is one too many."""
     rows = in_three_systems("isolation", "topics_others", "count", others, spread=[1.0])
     found = judged("h", rows)
     assert found.verdict is verdict
