@@ -3,15 +3,17 @@
 ``rce run master_discovery_fkie master_discovery _mcast_group:=224.0.0.1`` is ``rce discovery``, and
 ``rce run master_sync_fkie master_sync _sync_topics:="[/a, /b]"`` is ``rce sync``. Parameters may be on the
 command line, or at the master, where a launch file puts them. Those of the command line override the others,
-and are put there too.
+and are put there too. Parameters that ours do not have are named in a warning: a launch file that starts
+fkie's nodes starts ours.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import sys
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -32,11 +34,14 @@ from rce.ros.node.master import MasterClient
 from rce.ros.node.settings import NodeSettings
 from rce.ros.xmlrpc import RpcClient
 
+_log = logging.getLogger(__name__)
+
 MASTER_POLL = 0.5
 """Seconds between two attempts to reach the master."""
 _OWN = ("master_uri", "node_name")
 """Settings that have no parameter of their own."""
 _DISCOVERY = {field.name: field.type for field in fields(DiscoverySettings) if field.name not in _OWN}
+_SYNC = {field.name for field in fields(SyncLists)}
 _NO_EFFECT = ("resync_on_reconnect", "resync_on_reconnect_timeout", "sync_topics_on_demand")
 """Parameters of master_sync that ours does not need: it always syncs again."""
 _WRITTEN = frozenset(name.removeprefix("~") for name in (URI_PARAMETER, RECORD))
@@ -64,16 +69,17 @@ def discovery_settings(
         node_name: The node's name, without namespace.
 
     Raises:
-        MultimasterError: A parameter is unknown, or its value is of another type.
+        MultimasterError: The value of a parameter is of another type.
         ValueError: A value is out of range.
     """
     chosen: dict[str, Any] = {}
     for name, value in values.items():
         if name not in _DISCOVERY:
-            raise MultimasterError(
-                f"~{name} is not a parameter of master_discovery; known are {', '.join(sorted(_DISCOVERY))}"
-            )
-        chosen[name] = tuple(map(str, names(value))) if name == "robot_hosts" else _checked(name, value)
+            _warn("master_discovery", name, _DISCOVERY)
+        elif name == "robot_hosts":
+            chosen[name] = tuple(map(str, names(value)))
+        else:
+            chosen[name] = _checked(name, value)
     return DiscoverySettings(master_uri=master_uri, node_name=node_name, **chosen)
 
 
@@ -84,7 +90,7 @@ def sync_lists(values: Mapping[str, Any]) -> SyncLists:
         values: fkie's private parameters.
 
     Raises:
-        MultimasterError: A parameter is unknown, or the interface file cannot be read.
+        MultimasterError: The interface file cannot be read.
     """
     options: dict[str, list[Any]] = {}
     file: Path | None = None
@@ -95,10 +101,12 @@ def sync_lists(values: Mapping[str, Any]) -> SyncLists:
                 file = _interface_file(str(value))
             case "sync_remote_nodes":
                 is_remote = bool(value)
+            case _ if name in _SYNC:
+                options[name] = names(value)
             case _ if name in _NO_EFFECT:
                 pass
             case _:
-                options[name] = names(value)
+                _warn("master_sync", name, {"interface_url", *_SYNC, *_NO_EFFECT})
     lists = read_lists(file, options)
     lists.sync_remote_nodes = lists.sync_remote_nodes or is_remote
     return lists
@@ -114,6 +122,12 @@ def names(value: Any) -> list[Any]:
         return value
     text = str(value).strip().removeprefix("[").removesuffix("]")
     return [name for part in text.split(",") if (name := part.strip().strip("'\""))]
+
+
+def _warn(node: str, name: str, known: Iterable[str]) -> None:
+    _log.warning(
+        "~%s is not a parameter of %s and has no effect; known are %s", name, node, ", ".join(sorted(known))
+    )
 
 
 def _checked(name: str, value: Any) -> Any:

@@ -44,8 +44,6 @@ def test_parameters_of_a_discovery() -> None:
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
-        ({"mcast_grp": "224.0.0.1"}, "~mcast_grp is not a parameter of master_discovery; known are active_"),
-        ({"master_uri": "http://x/"}, "~master_uri is not a parameter"),
         ({"mcast_port": "many"}, "~mcast_port must be of type int, not 'many'"),
         ({"rpc_port": 1.5}, "~rpc_port must be of type int, not 1.5"),
         ({"rpc_port": float("inf")}, "~rpc_port must be of type int, not inf"),
@@ -56,6 +54,27 @@ def test_wrong_parameters_of_a_discovery_are_named(values: dict[str, object], fa
     with pytest.raises(MultimasterError) as caught:
         discovery_settings(values)
     assert fault in str(caught.value)
+
+
+def test_unknown_parameters_are_named_and_have_no_effect(caplog: pytest.LogCaptureFixture) -> None:
+    """Launch files of fkie's nodes have parameters of other releases, and start ours."""
+    values = {"log_level": "INFO", "master_uri": "http://x/", "mcast_group": "224.0.0.1"}
+    settings = discovery_settings(values)
+    lists = sync_lists({"log_level": "INFO", "sync_topic": ["/pose"], "sync_topics": ["/map"]})
+    assert (settings.master_uri, settings.mcast_group, lists.sync_topics) == ("", "224.0.0.1", ["/map"])
+    warned = [message.partition("; known are ") for message in caplog.messages]
+    assert [(text, known.split(", ")[0]) for text, _, known in warned] == [
+        ("~log_level is not a parameter of master_discovery and has no effect", "active_request_after"),
+        ("~master_uri is not a parameter of master_discovery and has no effect", "active_request_after"),
+        ("~log_level is not a parameter of master_sync and has no effect", "do_not_sync"),
+        ("~sync_topic is not a parameter of master_sync and has no effect", "do_not_sync"),
+    ]
+
+
+def test_some_parameters_of_a_sync_are_not_needed(caplog: pytest.LogCaptureFixture) -> None:
+    values = {"resync_on_reconnect": True, "resync_on_reconnect_timeout": 5, "sync_topics_on_demand": True}
+    assert sync_lists(values) == sync_lists({})
+    assert caplog.messages == []
 
 
 def test_parameters_of_a_sync(tmp_path: Path) -> None:
@@ -69,7 +88,5 @@ def test_parameters_of_a_sync(tmp_path: Path) -> None:
 
 
 def test_wrong_parameters_of_a_sync_are_named() -> None:
-    with pytest.raises(MultimasterError, match="sync_topic is not a setting"):
-        sync_lists({"sync_topic": ["/map"]})
     with pytest.raises(MultimasterError, match="interface_url must be a file"):
         sync_lists({"interface_url": "http://x/y"})
