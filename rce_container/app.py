@@ -119,8 +119,9 @@ class App:
             _log.warning("%s", text)
         tls = None if identity is None else identity.client
         uids = UidPool(self.settings.first_uid, self.settings.uids)
-        namespace = NamespaceRuntime(home_bytes=self.settings.home_bytes, uids=uids)
-        podman = PodmanRuntime(self.settings.images, home_bytes=self.settings.home_bytes, uids=uids)
+        home_bytes, packages = self.settings.home_bytes, self.settings.packages
+        namespace = NamespaceRuntime(home_bytes=home_bytes, uids=uids, packages=packages)
+        podman = PodmanRuntime(self.settings.images, home_bytes=home_bytes, uids=uids, packages=packages)
         runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, podman, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
         if review := runtime.review(self.settings.packages):

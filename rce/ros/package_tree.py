@@ -73,13 +73,25 @@ class PackageTree:
         self._good_until = 0.0
         self._lock = threading.Lock()
 
+    @property
+    def is_slow(self) -> bool:
+        """Whether :meth:`packages` may take long now: it searches, or checks many folders for changes."""
+        found = self._found
+        return found is None or (len(found.stamps) > SMALL and time.monotonic() >= self._good_until)
+
     def packages(self) -> dict[str, Path]:
         """Return the folders of all packages by their names."""
         with self._lock:
             if self._found is None or not self._is_current(self._found):
                 self.searches += 1
                 self._found = self._search()
+                if len(self._found.stamps) > SMALL:  # how long the search is good for, a check has to say
+                    self._is_current(self._found)
             return self._found.packages
+
+    def doubt(self) -> None:
+        """Have the folders checked at the next call, however long the last check is good for."""
+        self._good_until = 0.0
 
     def _is_current(self, found: _Found) -> bool:
         began = time.monotonic()
@@ -87,7 +99,7 @@ class PackageTree:
             return True
         self.checks += 1
         is_current = all(stamp_of(path) == stamp for path, stamp in found.stamps.items())
-        if len(found.stamps) > SMALL:
+        if is_current and len(found.stamps) > SMALL:
             now = time.monotonic()
             self._good_until = now + CHECK_SHARE * (now - began)
         return is_current

@@ -22,6 +22,7 @@ An installed Python distribution adds packages and nodes by entry points; the pa
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import reprlib
@@ -204,6 +205,28 @@ class PackageIndex:
         target = distributed_packages().get(name)
         return None if target is None else folder_of(target)
 
+    async def look_ahead(self) -> None:
+        """Search in a thread where that may take long, so that look-ups after this do not hold the loop."""
+        if any(_tree(root).is_slow for root in self._searched()):
+            import asyncio
+
+            await asyncio.to_thread(self.look)
+
+    def look(self) -> None:
+        """Search the folders, or check them for changes; an error is raised again by the look-up itself."""
+        for root in self._searched():
+            with contextlib.suppress(Exception):
+                _tree(root).packages()
+
+    def doubt(self) -> None:
+        """Have the next look-up check all folders: another user, or another process, has searched them."""
+        for root in self._searched():
+            _tree(root).doubt()
+
+    def _searched(self) -> Iterator[Path]:
+        """Yield the folders that are searched in depth."""
+        return (root for root in self.path if not _is_distribution(root))
+
     def describe_path(self) -> str:
         """Return the path as text for errors."""
         return os.pathsep.join(map(str, self.path)) or "empty"
@@ -225,13 +248,17 @@ def installed_shares() -> list[Path]:
 
 def _find_below(root: Path, name: str) -> Path | None:
     """Return the folder of a package that is on or below one folder of the path."""
-    if root.name == "share" and (root.parent / "lib").is_dir():
+    if _is_distribution(root):
         return _installed(root, name)
     found = _tree(root).packages().get(name)
     if found is not None:
         return found
     child = root / name
     return child if _manifest(child) is None and _holds_definitions(child) else None
+
+
+def _is_distribution(root: Path) -> bool:
+    return root.name == "share" and (root.parent / "lib").is_dir()
 
 
 def _installed(share: Path, name: str) -> Path | None:
@@ -263,7 +290,7 @@ def _tree(root: Path) -> PackageTree:
     if found is None:
         while len(_trees) >= MAX_TREES:
             _trees.pop(next(iter(_trees)), None)
-        found = _trees[root] = PackageTree(root, (*MANIFESTS, ROSBUILD_MANIFEST), _name_in)
+        found = _trees.setdefault(root, PackageTree(root, (*MANIFESTS, ROSBUILD_MANIFEST), _name_in))
     return found
 
 

@@ -241,6 +241,7 @@ class Environment:
     async def _apply_changes(self) -> None:
         while True:
             await self._news.wait()
+            await self._packages.look_ahead()  # interfaces look up their types
             self._news.clear()
             patches, self._patches = self._patches, []
             is_whole = self._all_due or self._holds_back or self._user_packages.is_waiting

@@ -1,7 +1,8 @@
 """``python -m rce_container.forkserver PADDING``: forks environments on the orders of one manager.
 
 Its standard input is a socket for the orders; it ends when the other end is closed. It has one thread and no
-event loop. It holds no secret, because every environment inherits its memory.
+event loop. It holds no secret, because every environment inherits its memory: also what it found on the
+machine's package path, ``RCE_PACKAGE_PATH``.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 
 import msgspec
 
+from rce.ros.packages import PackageIndex
 from rce.supervision.title import set_title, show_variables
 from rce_container.environment.messages import Boot
 from rce_container.environment.nodes.fork_server import NodeForkServer
@@ -44,6 +47,8 @@ for _module in ("encodings.idna", "importlib.metadata", "uvloop", "yaml", "xml.e
         importlib.import_module(_module)
 
 _DESCRIPTORS = len(Descriptors._fields)
+_LOOK_SHARE = 100
+"""Packages are looked for in a hundredth of the time at most: orders wait meanwhile."""
 
 
 def main() -> None:
@@ -56,18 +61,21 @@ def main() -> None:
     kernel.become_subreaper()
     gc.collect()
     gc.freeze()  # no garbage collection touches, and so copies, the pages that the children share
-    found = _wait(orders)
+    packages = PackageIndex.from_environ()
+    found = _wait(orders, packages)
     if found is not None:
         orders.close()
+        packages.doubt()  # the container's user may not see all of it
         _live(*found, program)
 
 
-def _wait(orders: socket.socket) -> tuple[SpawnRequest, Descriptors] | None:
+def _wait(orders: socket.socket, packages: PackageIndex) -> tuple[SpawnRequest, Descriptors] | None:
     """Fork a child for each order.
 
     Return in the children, and with None when the manager has disconnected.
     """
     packet = bytearray(MAX_PACKET)
+    due = 0.0
     while True:
         size, fds = _receive(orders, packet)
         if not size:
@@ -78,6 +86,11 @@ def _wait(orders: socket.socket) -> tuple[SpawnRequest, Descriptors] | None:
         packet[:size] = bytes(size)  # the next container must not find the data of the one before
         for fd in fds:
             os.close(fd)
+        if time.monotonic() >= due:  # after an order, which does not wait; later environments inherit it
+            began = time.process_time()
+            packages.look()
+            gc.freeze()
+            due = time.monotonic() + _LOOK_SHARE * (time.process_time() - began)
 
 
 def _receive(orders: socket.socket, packet: bytearray) -> tuple[int, array.array[int]]:

@@ -23,7 +23,7 @@ from functools import cache
 from pathlib import Path
 
 from rce.model.volumes import overlap
-from rce.ros.packages import distributed_folders
+from rce.ros.packages import PATH_VARIABLES, distributed_folders
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError, VolumeError
@@ -72,13 +72,17 @@ class NamespaceRuntime(Runtime):
     Args:
         home_bytes: Size of a container's home.
         uids: The users for containers, as root; None takes the default ones.
+        packages: The machine's folders of packages, which are searched once for all containers.
     """
 
     name = "namespace"
     isolated = True
 
-    def __init__(self, *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None) -> None:
+    def __init__(
+        self, *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None, packages: Iterable[Path] = ()
+    ) -> None:
         self._home_bytes = home_bytes
+        self._packages = os.pathsep.join(map(str, packages))
         self._uids = uids or UidPool(FIRST_UID, UIDS)
         self._root = os.geteuid() == 0
         self._bwrap = shutil.which("bwrap") or ""
@@ -93,7 +97,8 @@ class NamespaceRuntime(Runtime):
         self._fork_server.close()
         program, missing = _make_filter()
         self.detail = "; ".join(filter(None, (missing, self._claimed())))
-        self._fork_server = ForkServer(program, clean_environ(HOME))
+        environ = {**clean_environ(HOME), PATH_VARIABLES[0]: self._packages}
+        self._fork_server = ForkServer(program, environ)
         failures: list[Exception] = []
         trying = threading.Thread(target=self._try, args=(failures,))  # this thread may run an event loop
         trying.start()

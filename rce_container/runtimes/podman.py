@@ -17,7 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -89,14 +89,20 @@ class PodmanRuntime(NamespaceRuntime):
             any, those have the machine's programs.
         home_bytes: Size of a container's home.
         uids: The users for containers; None takes the default ones.
+        packages: The machine's folders of packages, which are searched once for all containers.
     """
 
     name = "podman"
 
     def __init__(
-        self, images: Sequence[str] = (), *, home_bytes: int = HOME_BYTES, uids: UidPool | None = None
+        self,
+        images: Sequence[str] = (),
+        *,
+        home_bytes: int = HOME_BYTES,
+        uids: UidPool | None = None,
+        packages: Iterable[Path] = (),
     ) -> None:
-        super().__init__(home_bytes=home_bytes, uids=uids)
+        super().__init__(home_bytes=home_bytes, uids=uids, packages=packages)
         self.image = images[0] if images else ""
         self._images = tuple(images)
         self._podman = shutil.which("podman") or ""

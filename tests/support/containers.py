@@ -93,13 +93,13 @@ class Machine:
         self, folder: Path, runtime: str, images: Sequence[str] = (), home_bytes: int = HOME_BYTES
     ) -> None:
         self.folder = folder
-        podman = PodmanRuntime(images, home_bytes=home_bytes)
-        namespaces = NamespaceRuntime(home_bytes=home_bytes)
+        self.packages = folder / "packages"
+        podman = PodmanRuntime(images, home_bytes=home_bytes, packages=(self.packages,))
+        namespaces = NamespaceRuntime(home_bytes=home_bytes, packages=(self.packages,))
         runtimes: tuple[Runtime, ...] = (namespaces, podman, ProcessRuntime())
         self.runtimes = {one.name: one for one in runtimes}
         self.runtime = self.runtimes[runtime]
         self.runtime.probe()
-        self.packages = folder / "packages"
         nodes = self.packages / "own" / "nodes"
         nodes.mkdir(parents=True)
         (self.packages / "own" / "package.yaml").write_text("name: own\n")

@@ -85,7 +85,9 @@ class NodeLife:
         """Run this life. Reports the start when it is known, and the end when no process is left."""
         mark = f"{self._context.mark}.{self._spec.tag}.{self.life}"
         try:
-            launch = prepare(self._context.launch_environment(self._spec), mark)
+            launch_environment = self._context.launch_environment(self._spec)
+            await launch_environment.packages.look_ahead()
+            launch = prepare(launch_environment, mark)
             event = await self._live(launch)
         except NodeError as error:
             event = Refused(self._spec.tag, self.life, str(error), hopeless=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import resource
+import shutil
 import signal
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -90,6 +91,21 @@ async def test_a_container_starts_beside_many_descriptors(namespaces: Machine) -
     async with namespaces.engine():
         await running(namespaces)
         assert namespaces.faults == []
+
+
+@pytest.mark.needs("root")
+async def test_environments_inherit_the_search_for_packages(namespaces: Machine) -> None:
+    """A folder that only the engine may list has a package: a container knows of it by what was found."""
+    machine = namespaces
+    closed = machine.packages / "closed"
+    shutil.copytree(machine.packages / "own", closed / "deep")
+    (closed / "deep" / "package.yaml").write_text("name: deep\n")
+    closed.chmod(0o711)
+    async with machine.engine():
+        await running(machine, "user/other")
+        await running(machine, nodes=(NodeSpec(tag="deep", pkg="deep", exe="talk.py"),))
+        await machine.log_holds(BOX, "deep", "hello")
+        assert machine.faults == []
 
 
 async def test_containers_do_not_need_the_fork_server(namespaces: Machine) -> None:

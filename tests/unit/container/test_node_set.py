@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
+import threading
 from pathlib import Path
 from typing import NoReturn
 
@@ -10,11 +12,13 @@ import pytest
 
 from rce.control.model import NodeState
 from rce.model.specs import NodeSpec
+from rce.ros.packages import PackageIndex
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import node_set
 from rce_container.environment.nodes.node_life import NodeContext
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
+from rce_container.environment.user_packages import LaunchEnvironment
 
 
 def context(folder: Path, faults: list[str]) -> NodeContext:
@@ -44,6 +48,31 @@ def context(folder: Path, faults: list[str]) -> NodeContext:
 
 def spec(tag: str) -> NodeSpec:
     return NodeSpec(tag=tag, pkg="x", exe="y")
+
+
+async def test_packages_of_a_node_are_looked_for_in_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The event loop, which carries the container's topics, does not wait for a large folder."""
+    threads: list[bool] = []
+
+    def look(_: PackageIndex) -> None:
+        threads.append(threading.current_thread() is threading.main_thread())
+
+    monkeypatch.setattr(PackageIndex, "look", look)
+    index = PackageIndex([tmp_path / "workspace"])
+    faults: list[str] = []
+    found_by_index = dataclasses.replace(
+        context(tmp_path, faults), launch_environment=lambda node: LaunchEnvironment(node, index, {})
+    )
+    async with asyncio.TaskGroup() as tasks:
+        found = NodeSet(found_by_index, tasks)
+        found.apply([spec("a")])
+        while found.statuses[0].state is not NodeState.FAILED:
+            await asyncio.sleep(0)
+        await found.close()
+    assert threads == [False]
+    assert "no package 'x' on the package path" in faults[0]
 
 
 async def test_what_cannot_be_started_is_told_and_noted(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import logging
 import os
 import random
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -164,6 +165,62 @@ def test_a_large_tree_is_looked_at_seldom(tmp_path: Path, monkeypatch: pytest.Mo
         searched.packages()
     assert searched.searches == 1
     assert searched.checks <= 10_000 / package_tree.CHECK_SHARE
+
+
+@pytest.fixture
+def large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that counts as large, and whose checks are good for long."""
+    monkeypatch.setattr(package_tree, "SMALL", 1)
+    monkeypatch.setattr(package_tree, "CHECK_SHARE", 1e9)
+    package(tmp_path / "large" / "src" / "a")
+    return tmp_path / "large"
+
+
+def test_a_look_up_after_a_search_does_not_look_again(large: Path) -> None:
+    """Also not for changes: it may be in an event loop, where the search was in a thread."""
+    searched = tree(large)
+    was_slow = searched.is_slow
+    searched.packages()
+    assert (was_slow, searched.is_slow) == (True, False)
+    looked = searched.searches, searched.checks
+    searched.packages()
+    assert (searched.searches, searched.checks) == looked
+
+
+def test_a_small_folder_is_searched_once_and_is_never_slow(tmp_path: Path) -> None:
+    searched = tree(tmp_path)
+    searched.packages()
+    assert (searched.searches, searched.checks, searched.is_slow) == (1, 0, False)
+
+
+def test_what_another_user_found_is_checked_before_it_is_used(large: Path) -> None:
+    index = PackageIndex([large])
+    index.look()
+    moved = package(large / "src" / "b")
+    with pytest.raises(PackageNotFoundError):
+        index.find("b")
+    index.doubt()
+    assert index.find("b").path == moved
+
+
+async def test_only_slow_searches_are_made_in_a_thread(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[bool] = []
+    look = PackageTree.packages
+
+    def packages(self: PackageTree) -> dict[str, Path]:
+        threads.append(threading.current_thread() is threading.main_thread())
+        return look(self)
+
+    monkeypatch.setattr(PackageTree, "packages", packages)
+    index = PackageIndex([large, large / "absent"])
+    await index.look_ahead()
+    assert threads == [False, False]
+    await index.look_ahead()
+    assert threads == [False, False], "nothing to do"
+    assert index.find("a").path == large / "src" / "a"
+    index.doubt()
+    await index.look_ahead()
+    assert threads[3:] == [False, False]
 
 
 def test_a_whole_disk_is_not_searched(
