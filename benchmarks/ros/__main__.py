@@ -69,6 +69,10 @@ def measure(names: list[str], *, quick: bool, scratch: Path) -> None:
                 lambda: tools(masters, passes=2 if quick else 7),
             ),
             "memory": ("An idle node's process", lambda: suites.memory(uri, found)),
+            "packages": (
+                "Search of a package path",
+                lambda: suites.packages(scratch / "workspace", folders=1000 if quick else 10_000),
+            ),
         }
         for name in names or chosen:
             title, suite = chosen[name]
@@ -85,7 +89,7 @@ def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ros", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes, nodes and seconds")
-    words = ("echo", "rate", "fanout", "services", "registration", "joining", "tools", "memory")
+    words = ("echo", "rate", "fanout", "services", "registration", "joining", "tools", "memory", "packages")
     parser.add_argument("--only", nargs="+", choices=words, default=[], metavar="NAME")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:

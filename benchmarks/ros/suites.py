@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -19,6 +20,7 @@ from benchmarks.ros.sides import Side, end, result_of
 from benchmarks.roundtrip import SIZES
 from rce.ros.errors import RosError
 from rce.ros.node import Node
+from rce.ros.packages import PackageIndex
 from rce.ros.types import Message
 from rce.ros.xmlrpc import RpcClient
 
@@ -205,6 +207,24 @@ def memory(uri: str, sides: list[Side]) -> Rows:
             time.sleep(1)
             rows.append({"path": side.name, "MB": round(pss(psutil.Process(process.pid)) / 1e6, 1)})
     return rows
+
+
+def packages(workspace: Path, *, folders: int) -> Rows:
+    """A package path of many folders, of which a tenth are packages: a search, a check for changes."""
+    for number in range(folders):
+        folder = workspace / f"{number // 100}" / f"{number}"
+        folder.mkdir(parents=True)
+        if number % 10 == 0:
+            (folder / "package.xml").write_text(f"<package><name>p{number}</name></package>")
+    index = PackageIndex([workspace])
+    took = {}
+    for what in ("search", "check", "remembered"):
+        if what == "check":
+            index.doubt()
+        begin = time.perf_counter()
+        index.find("p0")
+        took[what] = time.perf_counter() - begin
+    return [{"folders": folders, **{f"{what} ms": round(1e3 * value, 3) for what, value in took.items()}}]
 
 
 @contextlib.contextmanager
