@@ -30,6 +30,7 @@ pytestmark = [
 
 HOME = Path(__file__).parents[2]
 TUTORIAL = HOME / "docs" / "tutorials" / "paper.md"
+FIRST = re.compile(r"^Run this first, in each of six terminals:\n\n```\n(.*?)```", re.DOTALL | re.MULTILINE)
 BLOCK = re.compile(r"<!-- (?:(\w+): )?(\w+)((?:, \w+: [^,]+?)*) -->\n```\n(.*?)```", re.DOTALL)
 GOALS = {"Robot1": 1, "Robot2": 15, "Robot3": 57}
 START_S = 150.0
@@ -46,7 +47,7 @@ class Block:
         system: The system that it is for; empty: for all.
         name: Of the terminal; ``look`` for commands that end by themselves.
         facts: What it is expected to print: ``ready``, ``shows``, ``hides``.
-        text: The commands.
+        text: The commands; the tutorial's first ones come before them, as in each terminal.
     """
 
     system: str
@@ -56,11 +57,13 @@ class Block:
 
 
 def read_blocks() -> list[Block]:
-    """Read the tutorial's blocks, except for its first one, which installs."""
+    """Read the tutorial's blocks, each with the first one before it."""
+    tutorial = TUTORIAL.read_text()
+    (first,) = FIRST.findall(tutorial)
     found = []
-    for system, name, facts, text in BLOCK.findall(TUTORIAL.read_text()):
+    for system, name, facts, text in BLOCK.findall(tutorial):
         pairs = (fact.split(": ", 1) for fact in facts.split(", ") if fact)
-        found.append(Block(system, name, dict(pairs), text))
+        found.append(Block(system, name, dict(pairs), first + text))
     return found
 
 
@@ -75,11 +78,13 @@ class Terminals:
     def __init__(self, machine: NetworkMachine, home: Path) -> None:
         self._machine = machine
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("ROS", "XDG"))}
+        folders = os.environ["PATH"].split(os.pathsep)
         self._env = kept | {
             "HOME": str(home),
             "XDG_RUNTIME_DIR": str(home),
-            "ROS_IP": "127.0.0.1",
-            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            # The tutorial's first block has to find the programs; what it installs is here already.
+            "PATH": os.pathsep.join(one for one in folders if Path(one) != Path(sys.executable).parent),
+            "MAKEFLAGS": "n",
             "PYTHONUNBUFFERED": "1",
         }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
@@ -13,7 +14,9 @@ from support.ports import free_ports
 
 from rce.ros.core import Core, Graph
 
-RCE = str(Path(sys.executable).parent / "rce")
+BIN = Path(sys.executable).parent
+RCE = str(BIN / "rce")
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "multi-master.md"
 LAUNCH = """<launch>
   <node pkg="master_discovery_fkie" type="master_discovery" name="master_discovery">
     <param name="mcast_group" value="224.0.0.1"/>
@@ -29,9 +32,18 @@ LAUNCH = """<launch>
 """
 
 
+def environ(core: Core, home: Path) -> dict[str, str]:
+    return {**os.environ, "ROS_MASTER_URI": core.uri, "ROS_IP": "127.0.0.1", "ROS_HOME": str(home)}
+
+
 def started(core: Core, home: Path, *words: str) -> AbstractAsyncContextManager[asyncio.subprocess.Process]:
-    env = {**os.environ, "ROS_MASTER_URI": core.uri, "ROS_IP": "127.0.0.1", "ROS_HOME": str(home)}
-    return process(RCE, *words, env=env)
+    return process(RCE, *words, env=environ(core, home))
+
+
+def typed(core: Core, home: Path, line: str) -> AbstractAsyncContextManager[asyncio.subprocess.Process]:
+    """Run a line by a shell."""
+    env = environ(core, home) | {"PATH": f"{BIN}:{os.environ['PATH']}"}
+    return process("bash", "-c", f"exec {line}", env=env)
 
 
 def topics(graph: Graph) -> set[str]:
@@ -39,12 +51,11 @@ def topics(graph: Graph) -> set[str]:
 
 
 async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
-    """One machine by command lines, one by a launch file: each gets the topics that it wants, no others."""
+    """One machine by the page's lines, one by a launch file: each gets what it wants, and nothing else."""
     port, here_rpc, there_rpc = free_ports(3)
-    ports = (f"_mcast_port:={port}", f"_rpc_port:={here_rpc}")
-    fast = (*ports, "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
-    discovery = ("run", "master_discovery_fkie", "master_discovery", "_mcast_group:=224.0.0.1", *fast)
-    sync = ("run", "master_sync_fkie", "master_sync", "_sync_topics:=[/Robot1/amcl_pose]")
+    ports = f"_mcast_port:={port} _rpc_port:={here_rpc}"
+    fast = f"{ports} _heartbeat_hz:=10 _rosmaster_hz:=10 _name:=planner _log_level:=DEBUG"
+    discovery, sync = re.findall(r"^rce run master_.*$", PAGE.read_text(), re.MULTILINE)
     file = tmp_path / "robot.launch"
     file.write_text(LAUNCH.format(port=port, rpc_port=there_rpc))
     async with (
@@ -52,8 +63,8 @@ async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
         Core(port=0) as there,
         node("planner", here.uri) as planner,
         node("robot", there.uri) as robot,
-        started(here, tmp_path, *discovery),
-        started(here, tmp_path, *sync),
+        typed(here, tmp_path, f"{discovery} {fast}"),
+        typed(here, tmp_path, sync),
         started(there, tmp_path, "launch", str(file), "--wait", "--no-log"),
     ):
         for name in ("/Robot1/amcl_pose", "/scan"):
@@ -64,7 +75,8 @@ async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
         await there.wait_until(lambda graph: "/Robot1/goalNodesList" in graph.topic_types, timeout=120)
         assert topics(here.graph) == {"/Robot1/amcl_pose", "/Robot1/goalNodesList", "/fleet/state"}
         assert topics(there.graph) == {"/Robot1/goalNodesList", "/Robot1/amcl_pose", "/scan"}
-        assert here.graph.parameters.get("/master_sync/sync_topics") == ["/Robot1/amcl_pose"]
+        wanted = ["/Robot1/amcl_pose", "/Robot1/goalNodesList"]
+        assert here.graph.parameters.get("/master_sync/sync_topics") == wanted
 
 
 async def test_killed_nodes_of_fkie_start_again_at_the_same_master(tmp_path: Path) -> None:
