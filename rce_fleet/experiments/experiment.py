@@ -12,7 +12,7 @@ from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from rce_fleet.experiments.bench import Bench
     from rce_fleet.experiments.measures import Value
@@ -32,6 +32,23 @@ assumption, and 0.15 to 0.25 would be as good.
 """
 NOT_ANY = "-"
 """System or software of a condition that has none."""
+
+
+class Link(NamedTuple):
+    """The client's link.
+
+    Attributes:
+        rate: Mbit/s in each direction.
+        delay: Milliseconds in each direction.
+    """
+
+    rate: float
+    delay: float
+
+    @property
+    def factors(self) -> dict[str, str]:
+        """The factors of conditions that are measured over it."""
+        return {"rate": f"{self.rate:g}", "delay": f"{self.delay:g}"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +136,11 @@ class Experiment(ABC):
     @abstractmethod
     def setups(self, options: Options) -> list[Condition]:
         """Return what is started once in each run."""
+
+    def links(self, options: Options) -> Sequence[Link]:
+        """Return the links that it needs beside the usual ones; they are measured first, too."""
+        del options
+        return ()
 
     @abstractmethod
     def seconds(self, setup: Condition, options: Options) -> float:

@@ -1,7 +1,7 @@
 """Measures a link between two machines: ``link_probe serve ADDRESS`` on one, ``measure ADDRESS`` on another.
 
 It prints one line of JSON: ``round_trip_s`` (median), ``round_trip_p99_s``, ``lost`` (share of the probes
-without an answer), ``rate`` (payload of TCP, bits per second).
+without an answer), ``rate`` and ``rate_back`` (payload of TCP there and back, bits per second).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CHUNK = 65_536
 
 
 def serve(address: str) -> None:
-    """Answer probes and take a stream, until killed."""
+    """Answer probes, take streams and send others back, until killed."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probes,
         socket.create_server((address, PORT)) as streams,
@@ -46,11 +46,13 @@ def measure(address: str) -> dict[str, float]:
         OSError: It is not reached.
     """
     trips = _round_trips(address)
+    there, back = _rates(address)
     return {
         "round_trip_s": float(np.median(trips)) if trips else float("inf"),
         "round_trip_p99_s": float(np.percentile(trips, 99)) if trips else float("inf"),
         "lost": 1 - len(trips) / PROBES,
-        "rate": _rate(address),
+        "rate": there,
+        "rate_back": back,
     }
 
 
@@ -62,12 +64,20 @@ def _answer(probes: socket.socket) -> None:
 
 
 def _take(stream: socket.socket) -> None:
-    """Read a stream to its end, then tell how many bytes came."""
+    """Read a stream to its end, tell how many bytes came, and send a stream back."""
     taken = 0
     with contextlib.suppress(OSError):
         while data := stream.recv(_CHUNK):
             taken += len(data)
-        stream.sendall(str(taken).encode())
+        stream.sendall(f"{taken}\n".encode())
+        _send(stream)
+
+
+def _send(stream: socket.socket) -> None:
+    chunk = bytes(_CHUNK)
+    began = time.monotonic()
+    while time.monotonic() - began < RATE_SECONDS:
+        stream.sendall(chunk)
 
 
 def _round_trips(address: str) -> list[float]:
@@ -92,15 +102,18 @@ def _round_trips(address: str) -> list[float]:
     return trips
 
 
-def _rate(address: str) -> float:
-    chunk = bytes(_CHUNK)
+def _rates(address: str) -> tuple[float, float]:
+    """Return the rates of a stream there and of one back, bits per second."""
     with socket.create_connection((address, PORT)) as stream:
         began = time.monotonic()
-        while time.monotonic() - began < RATE_SECONDS:
-            stream.sendall(chunk)
+        _send(stream)
         stream.shutdown(socket.SHUT_WR)
-        taken = int(stream.recv(64))
-        return 8 * taken / (time.monotonic() - began)
+        taken = int(stream.recv(64).partition(b"\n")[0])
+        there = 8 * taken / (time.monotonic() - began)
+        began, back = time.monotonic(), 0
+        while data := stream.recv(_CHUNK):
+            back += len(data)
+        return there, 8 * back / (time.monotonic() - began)
 
 
 def main() -> int:

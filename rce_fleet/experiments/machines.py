@@ -96,12 +96,14 @@ class LinkFigures:
         round_trip_p99_s: 99th percentile, seconds.
         lost: Share of the probes without an answer.
         rate: Bits per second of a TCP stream's payload.
+        rate_back: The same of a stream back.
     """
 
     round_trip_s: float
     round_trip_p99_s: float
     lost: float
     rate: float
+    rate_back: float
 
 
 async def check_machines() -> None:

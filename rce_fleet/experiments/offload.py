@@ -14,14 +14,14 @@ count as a link's effect.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rce_fleet.drivers.robot_models import load_model
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench, Reading
-from rce_fleet.experiments.experiment import NETBOOK_CORES, Experiment, Measured, Options, Trial
+from rce_fleet.experiments.experiment import NETBOOK_CORES, Experiment, Link, Measured, Options, Trial
 from rce_fleet.experiments.measures import Value, used
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.robot_energy import Effort, energy_of
@@ -42,20 +42,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 PLANNING = "planning"
-
-
-class Link(NamedTuple):
-    """The client's link.
-
-    Attributes:
-        rate: Mbit/s in each direction.
-        delay: Milliseconds in each direction.
-    """
-
-    rate: float
-    delay: float
-
-
 LINKS = (Link(50, 5), Link(50, 100), Link(0.5, 5), Link(0.3, 5))
 """The first one is the wireless LAN's; one has more delay, and two are as slow as what the robot sends."""
 START = (2.5, 0.5)
@@ -98,6 +84,10 @@ class Offload(Experiment):
         if "cloud" not in options.systems or "rce" not in options.software:
             return []
         return [Condition.of(self.name, "cloud", "rce", place=place) for place in (ROBOT, CLOUD)]
+
+    def links(self, options: Options) -> Sequence[Link]:
+        """Return the links over which the cloud is measured."""
+        return links_of(CLOUD, options) if self.setups(options) else ()
 
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
@@ -188,7 +178,7 @@ class _Run:
         report = await self._robot.do(task, self._patience(task), **order_of(task))
         later = await self._read()
         values = [value for machine in readings for value in used(machine, readings[machine], later[machine])]
-        factors = {"task": task, "rate": f"{link.rate:g}", "delay": f"{link.delay:g}"}
+        factors = {"task": task, **link.factors}
         if not self._bench.meters[CLIENT].limits:
             factors["cores"] = "all"
         found = figures_of(task, report, values, has_share="cores" not in factors)

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
+from rce_fleet.experiments.bench import CLIENT, DELAY_S, RATE, SERVER, Bench
 from rce_fleet.experiments.clock_watch import ClockWatch
-from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Options, Trial
+from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Link, Options, Trial
 from rce_fleet.experiments.results import Condition, Row, error_text, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 from rce_fleet.experiments.systems.base import together
@@ -35,8 +35,9 @@ PREPARED = "prepared"
 SAMPLE_S = 60.0
 """Planned time of what must be done until its pace counts for the rest."""
 LINK = "link"
-LINK_DELAYS_S = (0.005, 0.0, 0.02)
-LINK_UNITS = {"round_trip": "s", "round_trip_p99": "s", "lost": "", "rate": "bit/s"}
+USUAL_LINKS = tuple(Link(RATE / 1e6, delay) for delay in (1000 * DELAY_S, 0.0, 20.0))
+"""Links that are measured before all experiments; quickly, the first one only."""
+LINK_UNITS = {"round_trip": "s", "round_trip_p99": "s", "lost": "", "rate": "bit/s", "rate_back": "bit/s"}
 TRIES = 2
 """How often a run is tried before its error ends the experiment."""
 QUICK_AT_ONCE = 3
@@ -70,6 +71,13 @@ class Plan:
     def at_once(self) -> int:
         """How many runs are done at the same time; more than one disturb each other's figures."""
         return QUICK_AT_ONCE if self.options.quick else 1
+
+    def links(self) -> list[Link]:
+        """Return the links that are measured first: the usual ones, and those of the experiments."""
+        if self.options.quick:
+            return [USUAL_LINKS[0]]
+        further = (link for one in self.experiments for link in one.links(self.options_of(one)))
+        return list(dict.fromkeys((*USUAL_LINKS, *further)))
 
     def options_of(self, experiment: Experiment) -> Options:
         """Return how an experiment is done: with the software that has its programs."""
@@ -296,18 +304,19 @@ class Runner:
         return found
 
     async def _measure_link(self) -> None:
-        """Measure the shaped links."""
+        """Measure the shaped links, in both directions."""
         known = {row.condition for row in self.rows()}
-        for delay in LINK_DELAYS_S[: 1 if self._plan.options.quick else None]:
-            condition = Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay))
+        for link in self._plan.links():
+            condition = link_condition(link)
             if condition in known:
                 continue
-            async with Bench(delay=delay, seed=self._plan.seed) as bench:
+            async with Bench(delay=link.delay / 1000, rate=1e6 * link.rate, seed=self._plan.seed) as bench:
                 figures = await bench.probe(CLIENT, SERVER)
             self._say(
-                f"link with {1000 * delay:g} ms of delay: round trip {1000 * figures.round_trip_s:.1f} ms "
-                f"(99 % below {1000 * figures.round_trip_p99_s:.1f}), "
-                f"{figures.rate / 1e6:.1f} Mbit/s, {100 * figures.lost:.1f} % lost"
+                f"link of {link.rate:g} Mbit/s with {link.delay:g} ms of delay: round trip "
+                f"{1000 * figures.round_trip_s:.1f} ms (99 % below {1000 * figures.round_trip_p99_s:.1f}), "
+                f"{figures.rate / 1e6:.3g} Mbit/s to machine 1, {figures.rate_back / 1e6:.3g} Mbit/s back, "
+                f"{100 * figures.lost:.1f} % lost"
             )
             values = {name.removesuffix("_s"): value for name, value in asdict(figures).items()}
             write_rows(
@@ -327,6 +336,11 @@ class Runner:
             new.unlink(missing_ok=True)
             write_rows(new, kept)
             new.replace(self._table)
+
+
+def link_condition(link: Link) -> Condition:
+    """Return the condition of what is measured of a link itself."""
+    return Condition.of(LINK, NOT_ANY, NOT_ANY, **link.factors)
 
 
 def hash_of(seed: int, run: Run) -> int:

@@ -79,7 +79,7 @@ def test_each_experiment_has_figures_of_each_system(data: Data) -> None:
         for row in data.rows
         if row.metric == "lost" and row.condition.experiment != "robustness"
     )
-    assert data.values("link").keys() >= {"round_trip", "rate"}
+    assert data.values("link").keys() >= {"round_trip", "rate", "rate_back"}
 
 
 def test_circumstances_are_told(data: Data) -> None:

@@ -164,7 +164,9 @@ SECTIONS = (
         ),
     ),
 )
-LINK = TableSpec("The link as measured", _quantities("round_trip", "round_trip_p99", "rate", "lost"))
+LINK = TableSpec(
+    "The link as measured", _quantities("round_trip", "round_trip_p99", "rate", "rate_back", "lost")
+)
 
 READING = f"""\
 - *Median and interval.* `7.50 [7.41, 7.62]` is the median of the runs and its {100 * CONFIDENCE:.0f} %

@@ -15,13 +15,12 @@ from typer.testing import CliRunner
 
 from rce_fleet.experiments import environment
 from rce_fleet.experiments.command import _options, experiment
-from rce_fleet.experiments.experiment import NOT_ANY
 from rce_fleet.experiments.folders import go_on
 from rce_fleet.experiments.laser import Laser
 from rce_fleet.experiments.ownership import measuring
 from rce_fleet.experiments.report import drawing
-from rce_fleet.experiments.results import Condition, Row, write_rows
-from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, Plan
+from rce_fleet.experiments.results import Row, write_rows
+from rce_fleet.experiments.runner import DONE, USUAL_LINKS, Plan, link_condition
 
 SYSTEMS = "single_master,cloud"
 app = typer.Typer()
@@ -117,7 +116,7 @@ def test_two_experiments_at_once_say_so(data: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(drawing, "can_draw", lambda: False)
     options = _options(SYSTEMS, "rce", 5, quick=False)
     planned = Plan([Laser()], options, 1, seed=1)
-    links = [Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S]
+    links = map(link_condition, USUAL_LINKS)
     done = [Row(run.condition, 1, DONE, 1.0, "s") for _, run in planned.works(Laser(), []) if run.number]
     write_rows(data / "results.csv", [*(Row(link, 1, "rate", 1.0, "bit/s") for link in links), *done])
     with measuring():

@@ -19,14 +19,13 @@ from rce.config.documents import write_items
 from rce_client.ros_bridge.explain import wires
 from rce_fleet.experiments import offload as module
 from rce_fleet.experiments.bench import CLIENT, Reading
-from rce_fleet.experiments.experiment import NETBOOK_CORES, Options, Trial
+from rce_fleet.experiments.experiment import NETBOOK_CORES, Link, Options, Trial
 from rce_fleet.experiments.machines import Traffic
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.offload import (
     ARC,
     LINKS,
     PLANS,
-    Link,
     Offload,
     figures_of,
     links_of,
@@ -214,6 +213,11 @@ def test_on_the_robot_only_one_link_is_measured() -> None:
     assert links_of(ROBOT, Options()) == LINKS[:1]
     assert links_of(CLOUD, Options()) == LINKS
     assert links_of(CLOUD, Options(quick=True)) == LINKS[:1]
+
+
+def test_links_that_are_measured_themselves_are_the_clouds() -> None:
+    assert Offload().links(Options()) == LINKS
+    assert not Offload().links(Options(systems=("single_master",)))
 
 
 def test_setups_are_those_of_the_cloud_with_our_software() -> None:

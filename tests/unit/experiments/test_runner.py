@@ -8,14 +8,31 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import Self
 
 import pytest
 
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Measured, Options, Trial
+from rce_fleet.experiments import runner as module
+from rce_fleet.experiments.bench import CLIENT, SERVER
+from rce_fleet.experiments.catalogue import EXPERIMENTS
+from rce_fleet.experiments.command import QUICK_ROBOTS, QUICK_SECONDS
+from rce_fleet.experiments.experiment import Experiment, Link, Measured, Options, Trial
+from rce_fleet.experiments.folders import RUNS as RUNS_OF_ALL
+from rce_fleet.experiments.machines import LinkFigures
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
-from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, SAMPLE_S, TABLE, Pace, Plan, Runner
+from rce_fleet.experiments.runner import (
+    DONE,
+    SAMPLE_S,
+    TABLE,
+    USUAL_LINKS,
+    Pace,
+    Plan,
+    Runner,
+    link_condition,
+)
+from rce_fleet.experiments.systems.software import USUAL
 
 OPTIONS = Options(systems=("single_master", "cloud"), software=("rce",))
 QUICK = replace(OPTIONS, quick=True)
@@ -69,11 +86,52 @@ def runner(
     wall: Callable[[], float] = time.time,
 ) -> Runner:
     if not (folder / TABLE).exists():
-        conditions = [
-            Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S
-        ]
-        write_rows(folder / TABLE, [Row(condition, 1, "rate", 1.0, "bit/s") for condition in conditions])
+        write_rows(folder / TABLE, [Row(link_condition(one), 1, "rate", 1.0, "bit/s") for one in USUAL_LINKS])
     return Runner(Plan([dice], options, runs, seed), folder, said.append, wall=wall)
+
+
+class Dialled(Dice):
+    """Dice that are thrown over links, one of which is a usual one."""
+
+    def links(self, options: Options) -> list[Link]:
+        return [USUAL_LINKS[0], Link(0.5, 100)] if options.software else []
+
+
+class Wire:
+    """Machines whose link has the figures that were asked for, but is slower back."""
+
+    def __init__(self, *, delay: float, rate: float, seed: int) -> None:
+        assert seed == 1
+        self._figures = LinkFigures(2 * delay, 3 * delay, 0.0, rate, rate / 2)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None: ...
+
+    async def probe(self, machine: str, other: str) -> LinkFigures:
+        assert (machine, other) == (CLIENT, SERVER)
+        return self._figures
+
+
+@pytest.mark.parametrize("quick", [False, True])
+async def test_links_of_experiments_are_measured_both_ways(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, quick: bool
+) -> None:
+    """Each once, also those that only one experiment needs; quickly, only that of all."""
+    monkeypatch.setattr(module, "Bench", Wire)
+    said: list[str] = []
+    write_rows(tmp_path / TABLE, [])
+    await runner(tmp_path, Dialled(), said, options=QUICK if quick else OPTIONS).run()
+    rows = read_rows(tmp_path / TABLE)
+    expected = [USUAL_LINKS[0]] if quick else [*USUAL_LINKS, Link(0.5, 100)]
+    for metric, share in (("rate", 1e6), ("rate_back", 0.5e6)):
+        found = by_condition(rows, metric)
+        assert found == {link_condition(link): [share * link.rate] for link in expected}
+    assert quick or (
+        "link of 0.5 Mbit/s with 100 ms of delay: round trip 200.0 ms (99 % below 300.0), 0.5 Mbit/s to "
+        "machine 1, 0.25 Mbit/s back, 0.0 % lost" in said
+    )
 
 
 async def test_each_setup_is_warmed_up_and_run(tmp_path: Path) -> None:
@@ -130,6 +188,20 @@ async def test_other_seeds_make_another_order(tmp_path: Path) -> None:
         await runner(folder, dice, [], runs=1, seed=seed).run()
         orders.append(tuple(trial.setup.system for trial in dice.trials))
     assert len(set(orders)) > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "runs", "minutes"),
+    [
+        (Options(software=USUAL), RUNS_OF_ALL, 120),
+        (Options(software=USUAL, robots=QUICK_ROBOTS, seconds=QUICK_SECONDS, quick=True), 1, 3),
+    ],
+    ids=["all", "quick"],
+)
+def test_all_experiments_are_planned_to_fit(options: Options, runs: int, minutes: float) -> None:
+    """With the software that a machine with ROS has; a plan needs neither ROS nor machines."""
+    plan = Plan(list(EXPERIMENTS.values()), options, runs, 1)
+    assert sum(plan.seconds(one, []) for one in plan.experiments) <= 60 * minutes
 
 
 def test_the_rest_takes_as_long_as_what_was_done() -> None:
