@@ -1,10 +1,22 @@
 """Scans: the work of a full client, and what is measured in a run."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
 import pytest
 
-from rce_fleet.experiments.experiment import NETBOOK_CORES, Options
-from rce_fleet.experiments.laser import PAPER_HZ, calibrated, most_work, parts
+from rce_fleet.experiments import environment, usage
+from rce_fleet.experiments import laser as module
+from rce_fleet.experiments.bench import CLIENT
+from rce_fleet.experiments.experiment import NETBOOK_CORES, Options, Trial
+from rce_fleet.experiments.laser import PAPER_HZ, Laser, calibrated, most_work, parts
+from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition
+from rce_fleet.experiments.streaming import Part
+from rce_fleet.experiments.usage import make_meter
 
 OPTIONS = Options(software=("ros", "rce"))
 SETUP = Condition.of("laser", "single_master", "ros")
@@ -39,3 +51,48 @@ def test_further_software_has_the_main_conditions_only() -> None:
     assert main == parts(OPTIONS, SETUP, 0.01)[: len(main)]
     assert {(part.factors["printed"], part.factors["rate"]) for part in main} == {("yes", "free")}
     assert {part.factors["client_cpu"] for part in main} == {"all", "full"}
+
+
+class Course:
+    """Stands for a bench with the best meter that there is, and for the streams on it."""
+
+    def __init__(self, *, seed: int = 0) -> None:
+        del seed
+        self.meters = {CLIENT: make_meter("rcx-course", "rcx-course")}
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None: ...
+
+    async def measure(self, wanted: Sequence[Part], seconds: float) -> list[tuple[Part, list[Value]]]:
+        del seconds
+        for part in wanted:
+            self.meters[CLIENT].limit(part.client_cores)
+        return [(part, [Value("rate", 30.0, "Hz")]) for part in wanted]
+
+
+async def test_without_control_groups_no_client_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All other conditions are measured, and the description says why these are missing."""
+    monkeypatch.setattr(usage, "ROOT", tmp_path)
+    assert not environment.can_limit()
+    course = Course()
+
+    async def start(*_: object) -> Course:
+        return course
+
+    monkeypatch.setattr(module, "Bench", lambda **_: course)
+    monkeypatch.setattr(module, "start", start)
+    options = Options(systems=("single_master",), software=("rce",))
+    assert await Laser().prepare(options, 1) == []
+    (setup,) = Laser().setups(options)
+    found = await Laser().measure(Trial(setup, options, 1, prepared={"scan_work": 0.01}))
+    factors = [dict(one.condition.factors) for one in found]
+    assert {one["client_cpu"] for one in factors} == {"all"}
+    assert {(one["printed"], one["rate"]) for one in factors} == {
+        ("yes", "free"),
+        ("yes", "fixed"),
+        ("no", "free"),
+    }
