@@ -23,3 +23,12 @@ def machine(request: pytest.FixtureRequest, folder: Path) -> Iterator[Machine]:
     machine = Machine(folder, request.param)
     yield machine
     machine.tidy()
+
+
+@pytest.fixture
+def pair(folder: Path) -> Iterator[tuple[Machine, Machine]]:
+    """Two machines whose volumes are folders."""
+    machines = (Machine(folder / "a", "process"), Machine(folder / "b", "process"))
+    yield machines
+    for machine in machines:
+        machine.tidy()
