@@ -11,6 +11,7 @@ from ssl import SSLContext
 from typing import TYPE_CHECKING, Protocol
 
 import pytest
+from support.client_types import STRING
 from support.cloud import PASSWORD, Cloud, PeerInterface, content_of, running_cloud
 
 from rce.aio.backoff import Backoff
@@ -126,6 +127,16 @@ class Engine:
             on_error=on_error,
             on_state=on_state,
         )
+
+
+async def stall(engine: Engine, conn: Connection) -> None:
+    """Fill what the network takes: what is sent from now on waits in the queue of the connection."""
+    say = await conn.publisher("stalled", STRING, raw=True)
+    await say.wait_active(10)
+    engine.stop_reading()
+    say.publish(bytes(32 << 20))
+    while conn._session.transport._queue:  # until it is in the socket, as far as it goes
+        await asyncio.sleep(0)
 
 
 def _server_sockets() -> list[RobotSocket]:
