@@ -9,7 +9,7 @@ import secrets
 import time
 from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
 from argon2 import PasswordHasher
@@ -18,8 +18,9 @@ from argon2.low_level import ARGON2_VERSION
 
 from rce.guard import CrowdedError, Turns
 from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
+from rce_master.lottery import Lottery
 from rce_master.state.user_records import KnownLogin, User
-from rce_master.throttle import MAX_DELAY_S, FailureThrottle
+from rce_master.throttle import AGAIN_S, MAX_DELAY_S, FailureThrottle, pair_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -54,9 +55,21 @@ def hash_public(digest: str) -> str:
 class _Check:
     """A password that is being checked; concurrent logins with the same password wait for the same check."""
 
-    put_off: bool
-    result: asyncio.Task[bool | TooManyLoginsError]
+    name: str
+    stored: str
+    digest: str
+    address: str
+    pair: str
+    delay: float
+    """Seconds to wait because of the address."""
+    has_turn: bool
+    """Whether it need not wait for a turn of its address and user."""
     joined: int = 0
+    result: asyncio.Task[bool | TooManyFailuresError | TooManyLoginsError] = field(init=False)
+
+    @property
+    def is_put_off(self) -> bool:
+        return self.delay > 0 or not self.has_turn
 
 
 class Authenticator:
@@ -69,8 +82,8 @@ class Authenticator:
 
     Unknown passwords are checked in turns by address, and there by user, and delayed where they fail often
     (:mod:`rce_master.throttle`): the first login of a user waits for one check of each other user whose
-    password is guessed from the same address, regardless of the number of connections. A password that is set
-    while the master runs is known at once.
+    password is guessed from the same address, regardless of the number of connections, and draws lots with
+    guesses at its own user from there. A password that is set while the master runs is known at once.
 
     Args:
         tables: The state's tables, to read users and marks from.
@@ -99,6 +112,7 @@ class Authenticator:
         self._known: dict[str, str] = {}
         """Marks by user, of this run; the tables have those of earlier runs."""
         self._throttle = FailureThrottle()
+        self._lottery = Lottery(lambda pair: self._throttle.take(pair, self._clock()))
         self._workers = ThreadPoolExecutor(HASH_WORKERS, thread_name_prefix="argon2")
         self._turns = Turns(HASH_WORKERS, waiting=MAX_WAITING)
         self._checks: dict[str, _Check] = {}
@@ -172,7 +186,7 @@ class Authenticator:
             check = self._checks.get(mark)
             if check is None:
                 check = self._begin(name, stored, digest, mark, address)
-            elif check.put_off and check.joined >= MAX_JOINED:
+            elif check.is_put_off and check.joined >= MAX_JOINED:
                 raise TooManyFailuresError(MAX_DELAY_S)
             own = not check.joined
             check.joined += 1
@@ -180,34 +194,51 @@ class Authenticator:
             outcome = await asyncio.shield(check.result)
             if isinstance(outcome, bool):
                 return outcome
+            if isinstance(outcome, TooManyFailuresError):
+                raise TooManyFailuresError(outcome.retry_after)
             if own:
                 raise outcome
 
     def _begin(self, name: str, stored: str, digest: str, mark: str, address: str) -> _Check:
-        delay = self._throttle.admit(address, name, self._clock())
-        work = self._look(name, stored, digest, address, delay)
-        check = self._checks[mark] = _Check(bool(delay), asyncio.get_running_loop().create_task(work))
+        pair = pair_of(address, name)
+        if self._throttle.is_crowded(pair):
+            raise TooManyFailuresError(AGAIN_S)
+        has_turn = self._lottery.take(pair)
+        delay = self._throttle.admit(address, self._clock()) if has_turn else 0.0
+        check = _Check(name, stored, digest, address, pair, delay, has_turn)
+        self._checks[mark] = check
+        check.result = asyncio.get_running_loop().create_task(self._look(check))
         check.result.add_done_callback(lambda _: self._checks.pop(mark))
         return check
 
-    async def _look(
-        self, name: str, stored: str, digest: str, address: str, delay: float
-    ) -> bool | TooManyLoginsError:
-        if delay:
-            with self._throttle.delaying(address, name):
-                await asyncio.sleep(delay)
+    async def _look(self, check: _Check) -> bool | TooManyFailuresError | TooManyLoginsError:
+        if check.is_put_off and not await self._wait(check):
+            return TooManyFailuresError(AGAIN_S)
         # Unknown names share one turn: invented names do not give more turns.
-        member = name if name in self._tables.users else ""
+        member = check.name if check.name in self._tables.users else ""
         try:
-            async with self._turns.turn(address, member):
+            async with self._turns.turn(check.address, member):
                 self.checks += 1
-                right = await self._in_worker(self._compare, stored, digest)
+                right = await self._in_worker(self._compare, check.stored, check.digest)
         except CrowdedError:
-            self._throttle.passed(address, name, self._clock())
+            self._throttle.passed(check.address, check.pair, self._clock())
             return TooManyLoginsError()
         if right:
-            self._throttle.passed(address, name, self._clock())
+            self._throttle.passed(check.address, check.pair, self._clock())
         return right
+
+    async def _wait(self, check: _Check) -> bool:
+        """Wait for a turn, and because of the address; return whether the check may be made."""
+        began = self._clock()
+        with self._throttle.delaying(check.pair):
+            if not check.has_turn:
+                # Logins with the same password, as those of a fleet, have a ticket each.
+                if not await self._lottery.draw(check.pair, lambda: check.joined, MAX_DELAY_S):
+                    return False
+                check.delay = self._throttle.admit(check.address, self._clock())
+            left = MAX_DELAY_S - (self._clock() - began)
+            await asyncio.sleep(max(0.0, min(check.delay, left)))
+        return True
 
     async def _in_worker(self, work: Callable[..., T], *args: str) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._workers, work, *args)

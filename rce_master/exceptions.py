@@ -134,7 +134,7 @@ class TooManyFailuresError(AuthError):
     """Too many wrong passwords for this user from this address.
 
     Attributes:
-        retry_after: Seconds until the next attempt is checked.
+        retry_after: Seconds until the next attempt is worth while.
     """
 
     def __init__(self, retry_after: float) -> None:

@@ -2,9 +2,9 @@
 
 A check that fails costs a token of two buckets: that of the address and user, and that of the address.
 
-When the first is empty the next check has to wait for a token, and is refused when that takes longer than
-a login at a door may wait. When the second is empty checks wait for a moment, but are not refused: many
-robots and people share an address behind a router, and an attacker there must not lock them out.
+When the first is empty a check has to wait for its next token. Who gets that is drawn by lot among all who
+wait for one (:mod:`rce_master.lottery`): an attacker behind the same router makes others wait, but does not
+take every turn. When the second is empty checks wait for a moment: many robots and people share an address.
 
 A check that succeeds costs nothing, so a fleet behind one address is never slowed down by itself, and wrong
 passwords from one address cost those at other addresses nothing.
@@ -17,7 +17,6 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.guard import Rates
-from rce_master.exceptions import TooManyFailuresError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,6 +30,8 @@ FREE_OF_ADDRESS = 100
 PACE_OF_ADDRESS_S = 0.5
 MAX_DELAY_S = 5.0
 """Longest that a check is put off; less than a robot endpoint waits for the master's answer."""
+AGAIN_S = 1.0
+"""When a login that got no turn may try again; it has waited already."""
 MAX_ADDRESS_DELAY_S = 2.0
 """The same where only others at the address have failed."""
 MAX_DELAYED = 256
@@ -39,7 +40,7 @@ _LONGEST_NAME = 64
 
 
 class FailureThrottle:
-    """Counts failures and says how long the next check has to wait."""
+    """Counts failures, and tells how long the next check has to wait."""
 
     def __init__(self) -> None:
         self._pairs = Rates(per_second=1 / PACE_S, burst=FREE)
@@ -47,38 +48,40 @@ class FailureThrottle:
         self.delayed: Counter[str] = Counter()
         """Checks that are put off now, by address and user."""
 
-    def admit(self, address: str, user: str, now: float) -> float:
-        """Count a check as a failure, until :meth:`passed` takes it back.
+    def take(self, pair: str, now: float) -> float:
+        """Count a check of a user at an address as a failure, until :meth:`passed` takes it back.
+
+        Args:
+            pair: The address and user (:func:`pair_of`).
+            now: Seconds of a clock that never goes back.
+
+        Returns:
+            0 if it was counted and may be made; else the seconds until one may be.
+        """
+        return self._pairs.take(pair, now)
+
+    def admit(self, address: str, now: float) -> float:
+        """Count a check as a failure at an address, until :meth:`passed` takes it back.
 
         Args:
             address: Where it comes from.
-            user: Whose password it is said to be; need not exist.
             now: Seconds of a clock that never goes back.
 
         Returns:
             Seconds to wait before the check.
-
-        Raises:
-            TooManyFailuresError: It would have to wait too long; nothing was counted.
         """
-        pair = _pair(address, user)
-        delay = self._pairs.reserve(pair, now)
-        if delay > MAX_DELAY_S:
-            self._pairs.give_back(pair, now)
-            raise TooManyFailuresError(delay)
-        others = self._addresses.reserve(address, now)
-        if others > MAX_ADDRESS_DELAY_S:
+        delay = self._addresses.reserve(address, now)
+        if delay > MAX_ADDRESS_DELAY_S:
             self._addresses.give_back(address, now)  # who is not refused must not owe more and more
-        delay = max(delay, min(others, MAX_ADDRESS_DELAY_S))
-        if delay and self.delayed.total() >= MAX_DELAYED and self.delayed[pair]:
-            self.passed(address, user, now)
-            raise TooManyFailuresError(max(1.0, delay))
-        return delay
+        return min(delay, MAX_ADDRESS_DELAY_S)
+
+    def is_crowded(self, pair: str) -> bool:
+        """Return whether so many checks are put off that one more of this address and user is refused."""
+        return self.delayed.total() >= MAX_DELAYED and pair in self.delayed
 
     @contextlib.contextmanager
-    def delaying(self, address: str, user: str) -> Iterator[None]:
+    def delaying(self, pair: str) -> Iterator[None]:
         """Count a check among those that are put off while the context lasts."""
-        pair = _pair(address, user)
         self.delayed[pair] += 1
         try:
             yield
@@ -87,11 +90,12 @@ class FailureThrottle:
             if not self.delayed[pair]:
                 del self.delayed[pair]
 
-    def passed(self, address: str, user: str, now: float) -> None:
-        """Take back what :meth:`admit` counted: the check succeeded, or was not made."""
-        self._pairs.give_back(_pair(address, user), now)
+    def passed(self, address: str, pair: str, now: float) -> None:
+        """Take back all that was counted: the check succeeded, or was not made."""
+        self._pairs.give_back(pair, now)
         self._addresses.give_back(address, now)
 
 
-def _pair(address: str, user: str) -> str:
+def pair_of(address: str, user: str) -> str:
+    """Return the key of an address and a user; the user need not exist."""
     return f"{address} {user[:_LONGEST_NAME]}"

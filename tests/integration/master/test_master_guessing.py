@@ -30,6 +30,12 @@ RIGHT = "testUser"
 HOME, BAD, ELSEWHERE = "127.0.0.1", "127.0.0.66", "127.0.0.7"
 
 
+@pytest.fixture
+def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A login waits for its turn for a shorter time than there is between two."""
+    monkeypatch.setattr("rce_master.auth.MAX_DELAY_S", 0.3)
+
+
 async def log_in(
     url: str, password: str, address: str = HOME, user: str = "testUser", **headers: str
 ) -> tuple[int, str | None]:
@@ -59,6 +65,7 @@ async def test_guesses_lock_nobody_out_who_is_right(tmp_path: Path) -> None:
         assert (await log_in(url, RIGHT))[0] == 200
 
 
+@pytest.mark.usefixtures("short_waits")
 async def test_guesses_from_one_address_hold_up_no_other(run_site: RunSite) -> None:
     """The master starts with no memory of any password."""
     async with run_site(log_in=False) as site:
@@ -67,6 +74,7 @@ async def test_guesses_from_one_address_hold_up_no_other(run_site: RunSite) -> N
         assert {status for found in await bad for status in found} <= {401, 429, 503}
 
 
+@pytest.mark.usefixtures("short_waits")
 async def test_addresses_behind_a_trusted_proxy_are_told_apart(run_site: RunSite) -> None:
     async with run_site(log_in=False, trusted_proxies=(HOME,)) as site:
         found = await guess(site.url, HOME, **{"X-Forwarded-For": "192.0.2.66"})
@@ -81,6 +89,7 @@ async def test_addresses_behind_a_trusted_proxy_are_told_apart(run_site: RunSite
         assert 429 in {status for status, _ in await asyncio.gather(*claims)}
 
 
+@pytest.mark.usefixtures("short_waits")
 async def test_robots_are_counted_by_the_address_they_come_from(run_site: RunSite) -> None:
     """One robot endpoint carries the logins of all; wrong ones of one address hold up no other's."""
     async with run_site(log_in=False) as site, site.robots() as robots:

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
+import random
 from collections.abc import Iterator
 from typing import Literal
 
@@ -114,8 +117,6 @@ async def test_guesses_from_one_address_hold_up_nobody_else(gate: Gate) -> None:
     await guess(gate, FREE)
     delayed = asyncio.create_task(gate.auth.verify("zoe", client_digest("eleventh"), "192.0.2.66"))
     await asyncio.sleep(0)
-    with pytest.raises(TooManyFailuresError, match="from your address; try again in 6 s"):
-        await gate.auth.verify("zoe", client_digest("twelfth"), "192.0.2.66")
     assert gate.hasher.verified == FREE
     assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.1")).name == "zoe"
     assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.66")).name == "zoe"
@@ -123,19 +124,55 @@ async def test_guesses_from_one_address_hold_up_nobody_else(gate: Gate) -> None:
     delayed.cancel()
 
 
-async def test_who_is_right_is_slowed_down_and_not_refused(
-    gate: Gate, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Behind one address with somebody who guesses, an unknown password waits, and then gets in."""
-    slept = []
+async def test_right_password_gets_a_turn_beside_guesses(gate: Gate, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind one address with an attacker whose guesses wait all the time, more than there are turns."""
+    gate.auth._lottery._dice = random.Random(1)
+    numbers = itertools.count()
+    go = asyncio.Event()
+
+    async def breathe() -> None:
+        await asyncio.get_running_loop().run_in_executor(None, lambda: None)
 
     async def sleep(seconds: float) -> None:
-        slept.append(seconds)
+        await go.wait()
+        await breathe()
+        gate.now += seconds
 
-    await guess(gate, FREE)
+    async def guess_again_and_again() -> None:
+        while True:
+            with contextlib.suppress(WrongCredentialsError, TooManyFailuresError):
+                await gate.auth.verify("zoe", client_digest(f"guess {next(numbers)}"), "192.0.2.66")
+            await breathe()
+
     monkeypatch.setattr("rce_master.auth.asyncio.sleep", sleep)
-    assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.66")).name == "zoe"
-    assert slept == [PACE_S]
+    monkeypatch.setattr("rce_master.auth.MAX_DELAY_S", 600.0)
+    attackers = [asyncio.create_task(guess_again_and_again()) for _ in range(5)]
+    try:
+        while not gate.auth._throttle.delayed:
+            await breathe()
+        right = asyncio.create_task(gate.auth.verify("zoe", RIGHT, "192.0.2.66"))
+        await breathe()
+        assert not right.done()
+        go.set()
+        assert (await right).name == "zoe"
+        assert gate.hasher.verified <= FREE + 1 + gate.now / PACE_S
+    finally:
+        for attacker in attackers:
+            attacker.cancel()
+        await asyncio.wait(attackers)
+
+
+async def test_a_login_that_draws_no_turn_is_told_to_try_again(
+    gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that sent this password, at once: their check has waited as long as it may."""
+    monkeypatch.setattr("rce_master.auth.MAX_DELAY_S", 0.01)
+    await guess(gate, FREE)
+    logins = (gate.auth.verify("zoe", RIGHT, "192.0.2.66") for _ in range(3))
+    for error in await asyncio.gather(*logins, return_exceptions=True):
+        assert isinstance(error, TooManyFailuresError)
+        assert "from your address; try again in 1 s" in str(error)
+    assert gate.hasher.verified == FREE
 
 
 async def test_a_right_password_is_known_over_a_restart(gate: Gate) -> None:
