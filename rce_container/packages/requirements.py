@@ -114,22 +114,26 @@ class Installer:
         text = "\n".join(wanted.lines) + "\n"
         key = hashlib.sha256(f"{tag}\n{text}".encode()).hexdigest()
         path = self._folder / key
-        if not path.is_dir():
-            try:
-                async with self._turns.turn(user):
-                    await self._have(path, text, python)
-            except CrowdedError:
-                raise RequirementsTroubleError("too many requirements wait to be installed here") from None
+        try:
+            await self._have(user, path, text, python)
+        except CrowdedError:
+            raise RequirementsTroubleError("too many requirements wait to be installed here") from None
         await in_thread(os.utime, path)
         async with self._tidying:
             await in_thread(self._make_room, path)
         return path
 
-    async def _have(self, path: Path, text: str, python: str) -> None:
-        """Build missing requirements; concurrent callers wait for one build."""
-        async with self._locks.of(path.name):
-            if not await in_thread(path.is_dir):
-                await self._build(path, text, python)
+    async def _have(self, user: str, path: Path, text: str, python: str) -> None:
+        """Build missing requirements; callers who wait for another one's build have no turn meanwhile."""
+        while not await in_thread(path.is_dir):
+            async with self._turns.turn(user):
+                if path.name not in self._locks:
+                    async with self._locks.of(path.name):
+                        if not await in_thread(path.is_dir):
+                            await self._build(path, text, python)
+                    return
+            async with self._locks.of(path.name):
+                pass  # it is there now, or could not be built
 
     async def _build(self, path: Path, text: str, python: str) -> None:
         async with scratch_aside(self._folder / _SCRATCH) as folder:
