@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from websockets.frames import CloseCode
 
+from rce.buffers import write_together
 from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from rce.protocol import Frame
 
 JOIN_BELOW = 64 << 10
-"""Below this many bytes a copy costs less than another system call and another packet."""
+"""Below this many bytes a copy costs less than writing several buffers."""
 
 
 class EngineSocket(TlsClientConnection):
@@ -54,6 +55,6 @@ class EngineSocket(TlsClientConnection):
                     self.protocol.send_binary(frame)
             chunks = self.protocol.data_to_send()
             if sum(map(len, chunks)) < JOIN_BELOW:
-                chunks = [b"".join(chunks)]
-            for chunk in chunks:
-                self.transport.write(chunk)
+                self.transport.write(b"".join(chunks))
+            else:
+                write_together(self.transport, chunks)
