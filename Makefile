@@ -11,7 +11,7 @@ PARALLEL := -n auto --dist loadgroup --durations=25
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help packages install demo test test-all collect test-quick fuzz faults wheel lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all collect test-quick fuzz faults moments wheel lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -19,6 +19,7 @@ help:
 	@echo "make test-all  make test without linters and types        make test-quick  most unit tests"
 	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
 	@echo "make faults  kill, cut off and slow down masters and etcd; ARGS=\"--only kill --rounds 100 --seed 7\""
+	@echo "make moments  end rce up at random moments by random signals; COUNT=200 times, SEED=1"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make docs    the documentation as a site, in build/docs; needs no network"
@@ -60,6 +61,9 @@ fuzz: install
 
 faults: install
 	PYTHONPATH=tests $(BIN)/python -m faults $(ARGS)
+
+moments: install
+	PYTHONPATH=tests $(BIN)/python -m support.moments $(or $(SEED),1) $(or $(COUNT),200)
 
 test-quick: install
 	$(BIN)/python -m pytest -n logical -m "not slow" --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)

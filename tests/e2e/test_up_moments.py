@@ -13,8 +13,10 @@ pytestmark = [pytest.mark.e2e, pytest.mark.needs("bwrap")]
 CONTAINER = PROGRAMS[-1:]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-@pytest.mark.parametrize("pause", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("number", "pause"),
+    [(signal.SIGINT, 0.0), (signal.SIGINT, 1.0), (signal.SIGKILL, 0.0), (signal.SIGQUIT, 1.0)],
+)
 async def test_end_just_after_the_manager_was_killed(number: signal.Signals, pause: float) -> None:
     """The next ``rce-container`` does not run yet, or has not heard of signals yet."""
     assert (

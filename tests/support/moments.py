@@ -1,6 +1,6 @@
 """Ends ``rce up`` at random moments by random signals, its parts killed before or not: nothing may be left.
 
-``python -m support.moments SEED COUNT`` does it as often as is asked.
+``make moments`` (``python -m support.moments SEED COUNT``) does it as often as is asked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from tools.leaks import Traces, sweep_cgroups
 
 PORT_OPTIONS = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
 PROGRAMS = ("rce_master", "rce_robot", "rce_container")
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+AT_ONCE = (signal.SIGKILL, signal.SIGQUIT)
+"""Signals that end ``rce up`` at once: what it leaves is removed after it."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *AT_ONCE)
 BOXES = 2
 LONGEST_PAUSE_S = 3.0
 """Longer than ``rce-container`` takes from its death until it is ready again."""
@@ -57,7 +59,7 @@ class Moment:
         containers = dice.random() < 0.75
         killed = tuple(name for name in PROGRAMS if dice.random() < (0.7 if name == PROGRAMS[-1] else 0.2))
         signals = [dice.choice(SIGNALS)]
-        if signals[0] is not signal.SIGKILL and dice.random() < 0.3:
+        if signals[0] not in AT_ONCE and dice.random() < 0.3:
             signals.append(dice.choice(SIGNALS))
         longest = LONGEST_PAUSE_S if containers else LONGEST_START_S
         return cls(containers, killed if containers else (), dice.uniform(0, longest), tuple(signals))
@@ -65,6 +67,7 @@ class Moment:
 
 async def run(moment: Moment, runtime: str) -> list[str]:
     """Start an engine, end it at a moment, and return what is left of it."""
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)  # jobs in the background of a shell ignore it
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
     try:
         return await _run(moment, runtime, folder)
@@ -104,7 +107,7 @@ async def _run(moment: Moment, runtime: str, folder: Path) -> list[str]:
                 up.process.send_signal(number)
         async with asyncio.timeout(GONE_AFTER_S):
             await up.process.wait()
-    if signal.SIGKILL in moment.signals or all(map(_is_dying, _left(traces, folder))):
+    if not {*AT_ONCE}.isdisjoint(moment.signals) or all(map(_is_dying, _left(traces, folder))):
         with contextlib.suppress(AssertionError):
             await until(lambda: not _left(traces, folder), timeout=GONE_AFTER_S, what="nothing is left")
     return _left(traces, folder) and [*_left(traces, folder), up.output()]

@@ -72,6 +72,13 @@ def test_any_failure_fails_the_run_and_nothing_runs_twice(
     assert asked == ["packages", "docs", "install", "collect", "test-all"]
 
 
+def test_random_moments_are_as_many_as_asked() -> None:
+    argv = ["make", "--dry-run", "moments", "SEED=7", "COUNT=3"]
+    done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "-m support.moments 7 3" in done.stdout.splitlines()[-1]
+
+
 def test_workers_have_ports_of_their_own() -> None:
     for workers in (1, 2, 7):
         slices = [slice_of(f"gw{number}", workers) for number in range(workers)]
