@@ -5,12 +5,22 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+from support.experiment_page import (
+    CELL,
+    UNITS,
+    case_of_figures,
+    cells_of_cases,
+    cells_of_experiments,
+    cells_of_verdicts,
+    condition_of_case,
+    experiments_of_claims,
+    tables_of,
+)
 from support.experiment_rows import CRS, SMS, example_rows, in_three_systems, rows_of
 
 from rce_fleet.exceptions import ExperimentError
@@ -26,42 +36,9 @@ from rce_fleet.experiments.statistics import effect_size, estimate
 pytestmark = pytest.mark.slow
 """They need what draws, which takes long to load."""
 
-SYSTEMS = {"SMS": "single_master", "MMS": "multi_master", "CRS": "cloud", "-": "-"}
-SOFTWARE = {"ROS": "ros", "ROS C++": "roscpp", "RCE": "rce", "-": "-"}
-UNITS = {"µs": 1e-6, "ms": 1e-3, "%": 0.01, "kB": 1e3, "MB": 1e6, "GB": 1e9, "kbit/s": 1e3, "Mbit/s": 1e6}
-UNITS |= {f"{unit}/s": UNITS[unit] for unit in ("kB", "MB", "GB")}
-NUMBER = r"[-+]?\d+(?:\.\d+)?"
-CELL = re.compile(rf"({NUMBER}) (?:\[({NUMBER}), ({NUMBER})\]|\((\d+) runs?\))")
 _NAMES = re.compile(r"`[^`]*`|\w+=[\w.]+|[Mm]achine \d|within 25 %|by more than 5 %|of [\d.]+ Hz|for 1 s at")
 """Numbers of a reason that are not measured: in names and in what a claim says."""
 WIDE = (0.9, 0.95, 1.0, 1.02, 1.1)
-
-
-@dataclass
-class Table:
-    """A table of the page, with the heading and the lines of text before it."""
-
-    heading: str
-    about: str
-    head: list[str]
-    rows: list[dict[str, str]]
-
-
-def tables_of(page: str) -> Iterator[Table]:
-    heading = about = ""
-    lines: list[str] = []
-    for line in [*page.splitlines(), ""]:
-        if line.startswith("|"):
-            lines.append(line)
-            continue
-        if lines:
-            cells = [[cell.strip() for cell in one.strip("|").split(" | ")] for one in lines]
-            yield Table(
-                heading, about, cells[0], [dict(zip(cells[0], one, strict=True)) for one in cells[2:]]
-            )
-            lines = []
-        heading = line if line.startswith("## ") else heading
-        about = line if line.strip() and not line.startswith("</") else about
 
 
 def values_of(rows: Sequence[Row], condition: Condition, formula: str) -> list[float]:
@@ -91,12 +68,6 @@ def check_cell(text: str, values: Sequence[float], unit: str) -> None:
     assert found[4] is None or int(found[4]) == again.runs
 
 
-def unit_of(column: str) -> tuple[str, str]:
-    found = re.fullmatch(r"`([^`]+)`(?:, (.+))?", column)
-    assert found, column
-    return found[1], found[2] or ""
-
-
 @pytest.fixture(scope="module")
 def rows() -> list[Row]:
     extra = Condition.of("weather", CRS, "rce", sky="blue")
@@ -109,43 +80,14 @@ def page(rows: list[Row]) -> str:
     return page_text(Measurements.of(rows), {"value": {"cores": 2}}, {}, "images")
 
 
-def experiment_of(page: str, heading: str) -> str:
-    if heading == "## How it was measured":
-        return "link"
-    found = re.search(rf"^{re.escape(heading)}\n\nExperiment `([^`]+)`", page, re.MULTILINE)
-    assert found, heading
-    return found[1]
-
-
 def test_each_number_of_the_experiments_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
     cells = 0
-    for table in tables_of(page):
-        if table.head[:2] != ["system", "software"] or table.head[-1] != "runs":
-            continue
-        experiment = experiment_of(page, table.heading)
-        formula = found[1] if (found := re.search(r"\(`(\w+)`\)\*\*", table.about)) else ""
-        for line in table.rows:
-            factors = {name: line[name] for name in table.head[2:-1] if not name.startswith("`")}
-            factors = {name: value for name, value in factors.items() if value != "-"}
-            for column in (name for name in table.head if name.startswith("`")):
-                name, unit = unit_of(column)
-                one, _, place = name.partition("=")
-                more = {one: place} if place else {}
-                software = SOFTWARE[line["software"]]
-                condition = Condition.of(experiment, SYSTEMS[line["system"]], software, **factors, **more)
-                values = values_of(rows, condition, formula if place else name)
-                check_cell(line[column], values, unit)
-                assert not values or len(values) == int(line["runs"])
-                cells += 1
+    for cell in cells_of_experiments(page):
+        values = values_of(rows, cell.condition, cell.quantity)
+        check_cell(cell.text, values, cell.unit)
+        assert not values or len(values) == int(cell.runs)
+        cells += 1
     assert cells > 500
-
-
-def condition_of_case(experiment: str, software: str, case: str, system: str) -> Condition:
-    pairs = dict(part.split("=", 1) for part in case.split(", ")) if case != "-" else {}
-    pairs.pop("system", None)
-    if pairs.get("origin") == "server (CRS: container)":
-        pairs["origin"] = "container" if system == "CRS" else "server"
-    return Condition.of(experiment, SYSTEMS[system], SOFTWARE[software], **pairs)
 
 
 def check_effects(text: str, experiment: str, line: dict[str, str], case: str, rows: list[Row]) -> int:
@@ -164,37 +106,30 @@ def check_effects(text: str, experiment: str, line: dict[str, str], case: str, r
 
 def test_each_number_of_the_cases_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
     cells = effects = 0
+    for cell in cells_of_cases(page):
+        check_cell(cell.text, values_of(rows, cell.condition, cell.quantity), cell.unit)
+        cells += 1
     for table in tables_of(page):
-        if "case" not in table.head:
-            continue
-        experiment = re.findall(r"experiment `([^`]+)`", table.about)[0]
-        for line in table.rows:
-            for system in ("SMS", "MMS", "CRS"):
-                condition = condition_of_case(experiment, line["software"], line["case"], system)
-                if f"system={system}" in line["case"] or "system=" not in line["case"]:
-                    check_cell(
-                        line[system], values_of(rows, condition, line["quantity"].strip("`")), line["unit"]
-                    )
-                    cells += 1
-            effects += check_effects(line["Cliff's delta"], experiment, line, line["case"], rows)
+        if "case" in table.head:
+            (experiment,) = re.findall(r"experiment `([^`]+)`", table.about)
+            effects += sum(
+                check_effects(line["Cliff's delta"], experiment, line, line["case"], rows)
+                for line in table.rows
+            )
     assert cells > 300
     assert effects > 100
 
 
 def test_each_number_of_the_verdicts_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
-    (table,) = (table for table in tables_of(page) if "verdict" in table.head)
-    experiments = dict(re.findall(r"\((\w)\) [^\n]*: experiment `([^`]+)`", page))
     checked = 0
+    for cell in cells_of_verdicts(page):
+        check_cell(cell.text, values_of(rows, cell.condition, cell.quantity), cell.unit)
+        checked += 1
+    (table,) = (table for table in tables_of(page) if "verdict" in table.head)
+    experiments = experiments_of_claims(page)
     for line in table.rows:
-        experiment = experiments[line["claim"][1]]
-        figures, case = re.fullmatch(r"(.*) \(((?:[^()]|\([^()]*\))*)\)", line["figures"]).groups()  # type: ignore[union-attr]
-        for part in figures.split("; "):
-            formula, medians, unit = re.fullmatch(r"`([^`]+)`: (.*\])(?: (.*))?", part).groups()  # type: ignore[union-attr]
-            for system, text, *_ in re.findall(rf"(\w+) ({CELL.pattern})", medians):
-                condition = condition_of_case(experiment, line["software"], case, system)
-                check_cell(text, values_of(rows, condition, formula), unit or "")
-                checked += 1
-        check_effects(line["Cliff's delta"], experiment, line, case, rows)
+        _, case = case_of_figures(line["figures"])
+        check_effects(line["Cliff's delta"], experiments[line["claim"][1]], line, case, rows)
     assert checked > 50
 
 
