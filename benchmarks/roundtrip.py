@@ -24,6 +24,8 @@ TURNS = 5
 """The number of parts in which the trips of a size are measured in each pass."""
 
 Trip = Callable[[int], Awaitable[None]]
+Costs = dict[tuple[str, int], list[dict[str, float]]]
+"""Processor time per trip of each kind of process, by path and size; one for each part of the measurement."""
 
 
 def rounds_for(size: int) -> int:
@@ -99,7 +101,7 @@ def service_trip(client: Robot) -> Trip:
 async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = SIZES) -> list[dict[str, Any]]:
     """Measure all paths in turn, a few trips each, so that a drift of the machine affects all of them."""
     times: dict[tuple[str, int], list[float]] = {}
-    costs: dict[tuple[str, int], list[float]] = {}
+    costs: Costs = {}
     async with (
         bare_echo() as url,
         connect(url, compression=None, max_size=None) as bare,
@@ -135,9 +137,7 @@ async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = S
                     before = meter.read()
                     measured = await measure(trip, size, rounds)
                     times.setdefault((name, size), []).extend(measured)
-                    costs.setdefault((name, size), []).append(
-                        sum(meter.per_message(before, len(measured)).values())
-                    )
+                    costs.setdefault((name, size), []).append(meter.per_message(before, len(measured)))
         for client, container in (
             (forwarding, "benchForwarder"),
             (single, "benchSingle"),
@@ -147,9 +147,7 @@ async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = S
     return [_row(key, times, costs) for key in sorted(times, key=lambda key: key[1])]
 
 
-def _row(
-    key: tuple[str, int], times: dict[tuple[str, int], list[float]], costs: dict[tuple[str, int], list[float]]
-) -> dict[str, Any]:
+def _row(key: tuple[str, int], times: dict[tuple[str, int], list[float]], costs: Costs) -> dict[str, Any]:
     name, size = key
     figures = spread(times[key])
     bare = spread(times["bare websockets echo", size])["p50_ms"]
@@ -159,5 +157,10 @@ def _row(
         "p10_ms": round(1e3 * percentile(times[key], 0.1), 4),
         **figures,
         "x bare": round(figures["p50_ms"] / bare, 2),
-        "engine cpu_ms": round(percentile(costs[key], 0.5), 4),
+        "engine cpu_ms": _median([sum(cost.values()) for cost in costs[key]]),
+        **{part: _median([cost[part] for cost in costs[key]]) for part in costs[key][0]},
     }
+
+
+def _median(values: list[float]) -> float:
+    return round(percentile(values, 0.5), 4)

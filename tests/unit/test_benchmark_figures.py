@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 from benchmarks.figures import percentile
+from benchmarks.ros.programs import ours
+
+if TYPE_CHECKING:
+    from rce.ros.node import Node
 
 ROOT = Path(__file__).parents[2]
 TOUCHED = 300_000_000
@@ -44,6 +51,34 @@ def test_memory_of_light_robots_below_a_large_parent() -> None:
 def test_peak_of_a_process_begins_with_its_program() -> None:
     code = "from benchmarks.figures import own_memory; print(own_memory('VmHWM'))"
     assert 0 < below_a_large_parent(code) < TOUCHED / 1e6
+
+
+class CountedCalls:
+    """A node whose calls of services are counted."""
+
+    def __init__(self) -> None:
+        self.under_way = self.most = 0
+
+    async def wait_for_service(self, name: str, *, timeout: float) -> None:
+        pass
+
+    def service_client(self, name: str, kind: str, *, persistent: bool = True) -> CountedCalls:
+        return self
+
+    async def __call__(self, *, data: bool) -> None:
+        self.under_way += 1
+        self.most = max(self.most, self.under_way)
+        await asyncio.sleep(0)
+        self.under_way -= 1
+
+
+async def test_service_calls_are_measured_in_flight(capsys: pytest.CaptureFixture[str]) -> None:
+    node = CountedCalls()
+    await ours.call(cast("Node", node), "0.01")
+    found = json.loads(capsys.readouterr().out)
+    assert found.keys() == {"persistent", "single", "32 in flight"}
+    assert node.most == 32
+    assert min(found.values()) > 0
 
 
 def below_a_large_parent(code: str) -> float:

@@ -16,6 +16,7 @@ from rce.ros.types import Message
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
+IN_FLIGHT = 32
 
 
 def ready() -> None:
@@ -90,7 +91,7 @@ async def serve(node: Node) -> None:
 
 
 async def call(node: Node, seconds: str) -> None:
-    """Call one after the other; print calls per second over a kept connection and over new ones."""
+    """Print calls per second: one at a time over kept and over new connections, then many at a time."""
     await node.wait_for_service("flip", timeout=20)
     found = {}
     for kind in (True, False):
@@ -100,7 +101,22 @@ async def call(node: Node, seconds: str) -> None:
             await client(data=True)
             count += 1
         found["persistent" if kind else "single"] = count / (time.perf_counter() - begin)
+    found[f"{IN_FLIGHT} in flight"] = await _rate_in_flight(node, float(seconds))
     print(json.dumps(found), flush=True)
+
+
+async def _rate_in_flight(node: Node, seconds: float) -> float:
+    client = node.service_client("flip", SET_BOOL)
+    count, begin = 0, time.perf_counter()
+
+    async def call_again_and_again() -> None:
+        nonlocal count
+        while time.perf_counter() < begin + seconds:
+            await client(data=True)
+            count += 1
+
+    await asyncio.gather(*(call_again_and_again() for _ in range(IN_FLIGHT)))
+    return count / (time.perf_counter() - begin)
 
 
 async def beat(node: Node, count: str) -> None:

@@ -18,6 +18,7 @@ from std_srvs.srv import SetBool, SetBoolResponse
 
 BUFFER = 2**25
 QUEUE = None if os.environ.get("QUEUE") == "0" else 10
+IN_FLIGHT = 32
 
 
 def ready() -> None:
@@ -95,7 +96,7 @@ def serve() -> None:
 
 
 def call(seconds: str) -> None:
-    """Call one after the other."""
+    """Call one after the other; then in threads, each with a connection."""
     rospy.wait_for_service("flip", 20)
     found = {}
     for kind in (True, False):
@@ -105,7 +106,27 @@ def call(seconds: str) -> None:
             client(True)
             count += 1
         found["persistent" if kind else "single"] = count / (time.perf_counter() - begin)
+    found[f"{IN_FLIGHT} in flight"] = rate_in_flight(float(seconds))
     print(json.dumps(found), flush=True)
+
+
+def rate_in_flight(seconds: float) -> float:
+    """Call in threads; return calls per second."""
+    counts = [0] * IN_FLIGHT
+    begin = time.perf_counter()
+
+    def call_again_and_again(number: int) -> None:
+        client = rospy.ServiceProxy("flip", SetBool, persistent=True)
+        while time.perf_counter() < begin + seconds:
+            client(True)
+            counts[number] += 1
+
+    threads = [threading.Thread(target=call_again_and_again, args=(number,)) for number in range(IN_FLIGHT)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return sum(counts) / (time.perf_counter() - begin)
 
 
 def beat(count: str) -> None:
