@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks import attacks, failover
+from benchmarks.ros import tools
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -470,6 +471,7 @@ TARGETS = [
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),
+    Target("slowest ROS tool at our core", "ros.tools", _greatest("ratio"), tools.TARGET, "x rosmaster"),
 ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from benchmarks import exploration, figures, mapping, traffic
 from benchmarks.figures import Results
 from benchmarks.page import block, made
+from benchmarks.roundtrip import _row
 from benchmarks.summary import merged
 from benchmarks.targets import TARGETS
 
@@ -171,3 +173,50 @@ def test_block_says_where_and_when() -> None:
         "| load | rce-ros PSS MB |\n|---|---|\n| idle | 30.25 |\n\n<!-- end -->\nafter\n"
     )
     assert "Not measured yet" in made(page, {})
+
+
+def test_processor_time_is_shown_for_each_process() -> None:
+    """Where it was measured: older summaries have the sum only."""
+    old = {"path": "converter", "bytes": 20, "engine cpu_ms": 0.305}
+    parts = {"rce-robot cpu_ms": 0.15, "environment cpu_ms": 0.1, "node cpu_ms": 0.055}
+    for row, cell in ((old, "0.305"), (old | parts, "0.305 (0.150 + 0.100 + 0.055)")):
+        summary = {"roundtrip": {"machine": machine("2026-01-01"), "rows": [row]}}
+        assert f"| 20 |  |  | {cell} |  |" in block("roundtrip_cpu", summary)
+
+
+def test_round_trips_have_the_processor_time_of_each_process() -> None:
+    key = ("bare websockets echo", 20)
+    costs = [{"rce-robot cpu_ms": robot, "node cpu_ms": 0.5} for robot in (1.0, 2.0, 9.0)]
+    row = _row(key, {key: [0.001, 0.002]}, {key: costs})
+    assert {name: row[name] for name in row if "cpu" in name} == {
+        "engine cpu_ms": 2.5,
+        "rce-robot cpu_ms": 2.0,
+        "node cpu_ms": 0.5,
+    }
+
+
+def test_ros_libraries_are_shown_side_by_side() -> None:
+    rows = [
+        {"path": "ours", "bytes": 3, "p50_ms": 0.5, "of rospy": 0.25},
+        {"path": "rospy", "bytes": 3, "p50_ms": 2.0, "of rospy": 1.0},
+    ]
+    summary = {"ros.echo": {"machine": machine("2026-01-01"), "rows": rows}}
+    table = block("ros.echo", summary)
+    assert "| bytes | ours, p50 ms | rospy, p50 ms | ours, x rospy |\n|---:|---:|---:|---:|\n" in table
+    assert "\n| 3 | 0.5 | 2 | 0.25 |\n" in table
+    assert block("ros.echo", {}) == "Not measured yet: `.venv/bin/python -m benchmarks.ros`.\n"
+    assert block("rate", {}) == 'Not measured yet: `make bench ARGS="--only rate"`.\n'
+
+
+def test_slowest_command_line_tool_is_a_target() -> None:
+    """The suite also says so itself, in each row."""
+    rows = [{"nodes": "alive", "command": name, "ratio": ratio} for name, ratio in (("a", 1.3), ("b", 1.0))]
+    summary = {"ros.tools": {"machine": machine("2026-01-01"), "rows": rows}}
+    line = "| slowest ROS tool at our core | 1.3 x rosmaster | ≤ 1.2 x rosmaster | **missed** |"
+    assert line in block("targets", summary)
+
+
+def test_each_suite_of_the_ros_graph_is_on_the_page() -> None:
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"<!-- figures: ros\.(\w+) -->", page))
+    assert shown == {"echo", "rate", "fanout", "services", "registration", "joining", "memory", "tools"}
