@@ -8,6 +8,8 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from typing import Any
+from xmlrpc.client import ServerProxy
 
 import pytest
 from support.ros_busy_node import answering_second_call
@@ -22,7 +24,7 @@ from rce.ros.errors import (
     RemoteFaultError,
 )
 from rce.ros.node import Node
-from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, server
 from rce.ros.xmlrpc.codec import encode_call
 
 STRING = "std_msgs/String"
@@ -334,6 +336,26 @@ async def test_a_large_graph(core: Core) -> None:
         for number in range(nodes):
             assert core.forget_node(f"/n{number}")
         assert core.graph.nodes == core.graph.topic_types == {}
+
+
+async def test_calls_of_a_tool_share_a_connection(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of rosnode and rostopic, whose client is the standard library's: each connection costs time."""
+    opened = 0
+    made = server._Connection.connection_made
+
+    def counted(connection: server._Connection, transport: asyncio.BaseTransport) -> None:
+        nonlocal opened
+        opened += 1
+        made(connection, transport)
+
+    def ask() -> list[int]:
+        with ServerProxy(core.uri) as master:
+            tool: Any = master  # a call gives any value
+            return [tool.getSystemState("/tool")[0] for _ in range(10)]
+
+    monkeypatch.setattr(server._Connection, "connection_made", counted)
+    assert await asyncio.to_thread(ask) == [1] * 10
+    assert opened == 1
 
 
 async def _until(condition: Callable[[], bool]) -> None:
