@@ -89,7 +89,7 @@ class PackageTree:
                     self._is_current(self._found)
             return self._found.packages
 
-    def doubt(self) -> None:
+    def expire(self) -> None:
         """Have the folders checked at the next call, however long the last check is good for."""
         self._good_until = 0.0
 

@@ -218,10 +218,10 @@ class PackageIndex:
             with contextlib.suppress(Exception):
                 _tree(root).packages()
 
-    def doubt(self) -> None:
+    def expire(self) -> None:
         """Have the next look-up check all folders: another user, or another process, has searched them."""
         for root in self._searched():
-            _tree(root).doubt()
+            _tree(root).expire()
 
     def _searched(self) -> Iterator[Path]:
         """Yield the folders that are searched in depth."""

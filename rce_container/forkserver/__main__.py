@@ -65,7 +65,7 @@ def main() -> None:
     found = _wait(orders, packages)
     if found is not None:
         orders.close()
-        packages.doubt()  # the container's user may not see all of it
+        packages.expire()  # the container's user may not see all of it
         _live(*found, program)
 
 

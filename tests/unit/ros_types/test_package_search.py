@@ -199,7 +199,7 @@ def test_what_another_user_found_is_checked_before_it_is_used(large: Path) -> No
     moved = package(large / "src" / "b")
     with pytest.raises(PackageNotFoundError):
         index.find("b")
-    index.doubt()
+    index.expire()
     assert index.find("b").path == moved
 
 
@@ -218,7 +218,7 @@ async def test_only_slow_searches_are_made_in_a_thread(large: Path, monkeypatch:
     await index.look_ahead()
     assert threads == [False, False], "nothing to do"
     assert index.find("a").path == large / "src" / "a"
-    index.doubt()
+    index.expire()
     await index.look_ahead()
     assert threads[3:] == [False, False]
 
