@@ -252,7 +252,7 @@ async def measure(running: RunningEngine, name: str, *, offloaded: bool, seconds
         last = "/pose_keeper: started" if offloaded else "/obstacle_cells: started"
         pids = [int((await stack.enter_async_context(program("launch", launch, env, last)))[0])]
         fleet = written(folder, "fleet.config", write_items(fleet_config(account)))
-        station = [rce, "ui", fleet, "--port", "0"]
+        station = [rce, "ui", fleet, "--port", "0", "--state-dir", str(folder / "station")]
         printed = await stack.enter_async_context(program("station", station, {}, "rce ui ready: "))
         page = printed[-1].partition("rce ui ready: ")[2].split()[0]
         robot = [bridge, written(folder, "robot.config", text)]

@@ -56,7 +56,7 @@ from rce_fleet.station.layers.sources import LayerSource
 from rce_fleet.station.masters_watch import DemoProcess, MastersWatch, masters_text
 from rce_fleet.station.planner_client import PlannerClient
 from rce_fleet.station.private_files import KeptInFile
-from rce_fleet.station.recording import Recorder, open_records
+from rce_fleet.station.recording import Recorder, open_records, replay_file
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -102,14 +102,14 @@ def ui(
     ] = None,
     history: Annotated[
         Path | None,
-        typer.Option(help="File that keeps what the fleet did, for replays; default: in memory."),
+        typer.Option(help="File that keeps replays (default: those of the last day, in --state-dir)."),
     ] = None,
     world: Annotated[
         str, typer.Option(help="ROS master of the simulated world in which the fleet drives (rce sim).")
     ] = "",
     state_dir: Annotated[
         Path | None,
-        typer.Option(help="Folder for the station's webhooks, emergency stops and modes [STATE/station]."),
+        typer.Option(help="Folder of webhooks, emergency stops, modes and replays [STATE/station]."),
     ] = None,
     demo: Annotated[bool, typer.Option("--demo", hidden=True)] = False,
     tls: Tls = False,
@@ -150,6 +150,7 @@ def ui(
                 stops=stops_file(place, backend.fleet),
                 modes=modes_file(place, backend.fleet),
                 stop_modes=stop_modes_file(place, backend.fleet),
+                replay=replay_file(place, backend.fleet),
                 kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
@@ -304,6 +305,7 @@ async def serve(
     stops: Path | None = None,
     modes: Path | None = None,
     stop_modes: Path | None = None,
+    replay: Path | None = None,
     kill_leader: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
@@ -345,7 +347,7 @@ async def serve(
     )
     owed_modes = OwedModes(modes)
     manual_modes = ManualModes(fleet, view, owed_modes)
-    recorder = Recorder(view, open_records(history), feed.on_event)
+    recorder = Recorder(view, open_records(history, replay), feed.on_event)
     station = Station(
         view,
         fleet,

@@ -14,15 +14,26 @@ import msgspec
 T = TypeVar("T")
 
 
-def fleet_file(folder: Path, kind: str, fleet: str) -> Path:
+def fleet_file(folder: Path, kind: str, fleet: str, ending: str = "json") -> Path:
     """Return a file of a fleet: several stations of a machine may share the folder.
 
     Args:
         folder: The folder.
         kind: What is in the file, one word.
         fleet: What tells the fleet from others.
+        ending: Of the file's name.
     """
-    return folder / f"{kind}-{hashlib.sha256(fleet.encode()).hexdigest()[:12]}.json"
+    return folder / f"{kind}-{hashlib.sha256(fleet.encode()).hexdigest()[:12]}.{ending}"
+
+
+def make_private(file: Path) -> None:
+    """Make an empty file, and its folder, where they are missing. Blocks.
+
+    Raises:
+        OSError: They cannot be made.
+    """
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    os.close(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600))
 
 
 def write_private(file: Path, body: bytes) -> None:

@@ -2,7 +2,7 @@
 
 A record is written for each second in which something changed: poses and states of robots that changed, and
 blocked cells if they did. Every half minute a record is whole. Records are JSON, compressed, in SQLite: in a
-file, which outlives the station, or in memory. The oldest ones are removed to stay within the bound.
+file, which outlives the station, or in memory. The oldest ones are removed to stay within the bounds.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rce_fleet.station.private_files import fleet_file, make_private
 
 if TYPE_CHECKING:
     from rce_fleet.station.view import FleetView
@@ -30,11 +33,15 @@ MAX_BYTES = 256 << 20
 """Bound of all records, bytes."""
 IN_MEMORY_BYTES = 32 << 20
 """Bound of records that are in memory only, bytes."""
+RECORDS_LAST_S = 86400.0
+"""Records in a file that is not named by the user are removed when they are older, seconds."""
 FIGURES_LAST_S = 86400.0
 """Figures that are older are removed, seconds."""
+IN_USE_S = 2.0
+"""How long to wait for a station that is ending to leave the file."""
 MOST_FRAMES = 120
 """Most records in one answer."""
-_REMOVE_LATER = "DELETE FROM records WHERE time >= ? RETURNING LENGTH(data)"
+_REMOVE_OUTSIDE = "DELETE FROM records WHERE time < ? OR time >= ? RETURNING LENGTH(data)"
 _REMOVE_OLDEST = (
     "DELETE FROM records WHERE time IN (SELECT time FROM records ORDER BY time LIMIT 50)"
     " RETURNING LENGTH(data)"
@@ -49,15 +56,18 @@ class Records:
     Args:
         file: Where they are kept; None: in memory.
         limit: Most bytes of all records; None: :data:`MAX_BYTES`, or :data:`IN_MEMORY_BYTES` in memory.
+        last_s: Records that are older are removed, seconds.
 
     Raises:
-        sqlite3.Error: The file cannot be used.
+        sqlite3.Error: The file cannot be used, or another station uses it.
     """
 
-    def __init__(self, file: Path | None = None, limit: int | None = None) -> None:
+    def __init__(self, file: Path | None = None, limit: int | None = None, last_s: float = inf) -> None:
         self._limit = limit or (IN_MEMORY_BYTES if file is None else MAX_BYTES)
+        self._last_s = last_s
         self._lock = threading.Lock()
-        self._database = sqlite3.connect(str(file or ":memory:"), check_same_thread=False)
+        place = ":memory:" if file is None else str(file)
+        self._database = sqlite3.connect(place, timeout=IN_USE_S, check_same_thread=False)
         try:
             self._prepare(is_file=file is not None)
         except sqlite3.Error:
@@ -66,19 +76,22 @@ class Records:
 
     def _prepare(self, *, is_file: bool) -> None:
         """Make what is missing in the database."""
+        if is_file:
+            # Records of two stations in one file would be changes of each other.
+            self._database.execute("PRAGMA locking_mode=EXCLUSIVE")
+            self._database.execute("PRAGMA journal_mode=WAL")
+            self._database.execute("PRAGMA synchronous=NORMAL")
         self._database.execute(
             "CREATE TABLE IF NOT EXISTS records (time REAL PRIMARY KEY, whole INTEGER, data BLOB)"
         )
         self._database.execute("CREATE TABLE IF NOT EXISTS figures (time REAL PRIMARY KEY, data TEXT)")
-        if is_file:
-            self._database.execute("PRAGMA journal_mode=WAL")
-            self._database.execute("PRAGMA synchronous=NORMAL")
         ((self._bytes,),) = self._database.execute("SELECT TOTAL(LENGTH(data)) FROM records")
 
     def add(self, now: float, frame: Frame, *, whole: bool) -> None:
         """Write a record, and remove the oldest ones that do not fit.
 
-        A whole one removes those of later times: the clock was set back, and a replay would mix both.
+        A whole one removes those that are too old, and those of later times: the clock was set back, and a
+        replay would mix both.
 
         Args:
             now: Seconds since 1970.
@@ -93,7 +106,7 @@ class Records:
             with self._database:
                 kept = self._bytes + len(data)
                 if whole:
-                    kept -= self._run_removal(_REMOVE_LATER, now)
+                    kept -= self._run_removal(_REMOVE_OUTSIDE, now - self._last_s, now)
                 self._database.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (now, whole, data))
                 while kept > self._limit:
                     kept -= self._run_removal(_REMOVE_OLDEST)
@@ -163,14 +176,33 @@ class Records:
         self._database.close()
 
 
-def open_records(file: Path | None) -> Records:
-    """Return the records of a file; in memory if there is none, or if it cannot be used, which is logged."""
+def replay_file(folder: Path, fleet: str) -> Path:
+    """Return the file of a fleet's records where the user names none.
+
+    Args:
+        folder: The folder.
+        fleet: What tells the fleet from others.
+    """
+    return fleet_file(folder, "replay", fleet, "sqlite")
+
+
+def open_records(named: Path | None, default: Path | None = None) -> Records:
+    """Return the records of a file; in memory if it cannot be used, which is logged.
+
+    Args:
+        named: The file that the user named; it has all records that fit.
+        default: Else this one, which is made with its folder, and has those of :data:`RECORDS_LAST_S`.
+    """
     try:
-        return Records(file)
-    except sqlite3.Error as error:
+        if named is not None or default is None:
+            return Records(named)
+        make_private(default)
+        return Records(default, last_s=RECORDS_LAST_S)
+    except (sqlite3.Error, OSError) as error:
         _log.error(
-            "replays are kept in memory only: %s cannot be used: %s; move it away, or name another file",
-            file,
+            "replays are kept in memory only: %s cannot be used: %s; end another station that uses it, move"
+            " it away, or name another file",
+            named or default,
             error,
         )
         return Records()

@@ -178,7 +178,7 @@ async def test_station_serves_its_page_in_tls(world: World) -> None:
     async with Core(port=0) as core:
         process = await asyncio.create_subprocess_exec(
             *(str(BIN / "rce"), "ui", "--ros-master", core.uri, "--port", str(port), "--tls"),
-            *("--certificates", str(world.certificates.path)),
+            *("--certificates", str(world.certificates.path), "--state-dir", str(world.folder / "station")),
             env=world.env,
         )
         url = f"https://127.0.0.1:{port}/"

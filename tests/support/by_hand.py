@@ -27,8 +27,9 @@ async def started(engine: Engine, uri: str, ready: str, name: str, *words: str) 
         name: Of its log.
         words: The command line; the first word is a program of this project.
     """
-    home = {"ROS_HOME": str(engine.folder / "ros"), "ROS_LOG_DIR": str(engine.folder / "log")}
-    env = {**engine.env, "ROS_MASTER_URI": uri, **home}
+    homes = {"ROS_HOME": "ros", "ROS_LOG_DIR": "log", "XDG_STATE_HOME": "home"}
+    env = {**engine.env, "ROS_MASTER_URI": uri}
+    env |= {name: str(engine.folder / folder) for name, folder in homes.items()}
     program = Program(name, [str(BIN / words[0]), *words[1:]], env, engine.folder)
     await program.start(ready=ready)
     try:

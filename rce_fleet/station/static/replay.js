@@ -154,10 +154,15 @@ export class Replay extends EventTarget {
     this.live.setAttribute("aria-pressed", this.#at === null);
     this.play.setAttribute("aria-pressed", this.#playing);
     this.play.disabled = this.#at === null;
-    const text = this.#at === null ? "" : new Date(1000 * this.#at).toLocaleTimeString();
+    const text = this.#at === null ? "" : timeText(new Date(1000 * this.#at));
     this.output.textContent = text && this.#isLoading ? t("replay.loading") : text;
     this.slider.setAttribute("aria-valuetext", text || t("replay.live"));
     this.view.stage.classList.toggle("past", this.#at !== null);
     this.dispatchEvent(new Event("change"));
   }
+}
+
+// The records may be of yesterday.
+function timeText(at) {
+  return at.toDateString() === new Date().toDateString() ? at.toLocaleTimeString() : at.toLocaleString();
 }

@@ -90,6 +90,16 @@ class RunningStation:
             assert "reason" in json.loads(await page.receive_str(timeout=LIMIT_S))
             yield page
 
+    async def recorded(self) -> float:
+        """Wait until there is something to replay; return the time of the first record."""
+        async with asyncio.timeout(LIMIT_S):
+            while True:
+                async with self._browser.get(f"{self._url}api/v1/replay") as reply:
+                    first: float | None = (await reply.json())["first"]
+                if first is not None:
+                    return first
+                await asyncio.sleep(0.05)
+
     async def end(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
         async with asyncio.timeout(LIMIT_S):
@@ -117,13 +127,15 @@ async def station(master: str, folder: Path) -> AsyncIterator[RunningStation]:
 
 
 async def test_a_driven_robot_gets_its_mode_back_when_the_station_ends(tmp_path: Path) -> None:
-    """Before the program has ended; after a crash, once it runs again."""
+    """Before the program has ended; after a crash, once it runs again. What was recorded is there then."""
     async with planner() as (master, fleet):
         async with station(master, tmp_path) as running, running.driving():
+            first = await running.recorded()
             await running.end(signal.SIGKILL)
             assert fleet.mode == "manual"
         async with station(master, tmp_path) as running:
             await fleet.until("paused")
+            assert await running.recorded() == first
             async with running.driving():
                 await fleet.until("manual")
                 await running.end(signal.SIGTERM)

@@ -16,9 +16,12 @@ pytestmark = pytest.mark.needs("chromium")
 
 
 async def test_a_slow_answer_is_shown_while_the_page_plays() -> None:
-    """An answer takes longer than the time between two moments that are played."""
+    """An answer takes longer than the time between two moments that are played.
+
+    Moments of another day are shown with their date.
+    """
     async with site() as made:
-        start = time.time() - 100
+        start = time.time() - 90_000
         await fill_records(made, start)
         page = await made.open()
 
@@ -31,6 +34,8 @@ async def test_a_slow_answer_is_shown_while_the_page_plays() -> None:
         await page.locator("#replay-play:enabled").click()
         await page.wait_for_function("rceFleet.replay.shown > 0")
         await page.wait_for_function("at => rceFleet.replay.shown >= at", arg=start + 12)
+        shown = "document.querySelector('#replay-at').textContent"
+        await page.wait_for_function(f"{shown} === new Date(1000 * rceFleet.replay.at).toLocaleString()")
 
 
 async def test_a_drag_of_the_slider_loads_one_moment_at_a_time() -> None:

@@ -13,7 +13,15 @@ from unit.station.test_station_view import changes, pose, robot, state
 
 from rce.aio.tasks import cancel_and_wait
 from rce_fleet.station import recording
-from rce_fleet.station.recording import WHOLE_EVERY_S, Frame, Recorder, Records, open_records
+from rce_fleet.station.recording import (
+    RECORDS_LAST_S,
+    WHOLE_EVERY_S,
+    Frame,
+    Recorder,
+    Records,
+    open_records,
+    replay_file,
+)
 from rce_fleet.station.view import FleetView
 
 START = 1000.0
@@ -165,6 +173,52 @@ def test_a_file_stays_within_its_bound(view: FleetView, tmp_path: Path) -> None:
     again.close()
 
 
+def drive_for(recorder: Recorder, view: FleetView, first: float, seconds: int) -> None:
+    """Record a robot that drives from a time on."""
+    for second in range(seconds):
+        view.on_pose("Robot1", pose(0.1 * second, 0.5, 0.0))
+        record(recorder, first + second)
+
+
+def test_the_default_file_outlives_the_station(view: FleetView, tmp_path: Path) -> None:
+    """It is made, with its folder, and only its owner reads it; each fleet has its own."""
+    file = replay_file(tmp_path / "state" / "station", "here")
+    with closing(open_records(None, file)) as records:
+        drive_for(Recorder(view, records), view, START, 5)
+    assert (file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+    with closing(open_records(None, file)) as again:
+        assert again.range() == (START, START + 4)
+    assert replay_file(tmp_path, "here") != replay_file(tmp_path, "there")
+
+
+def test_the_default_file_has_the_last_day(view: FleetView, tmp_path: Path) -> None:
+    """A slider over the weeks of a small fleet would not find a moment. A file that is named keeps them."""
+    later = START + RECORDS_LAST_S + 60
+    for name, default, first in (("named", None, START), ("default", tmp_path / "default", START + 60)):
+        with closing(open_records(tmp_path / name if default is None else None, default)) as records:
+            recorder = Recorder(view, records)
+            drive_for(recorder, view, START, 100)
+            drive_for(recorder, view, later, 2)
+            assert records.range() == (first, later + 1)
+            assert records.read(later, 0.0)[0]["robots"]["Robot1"][0] == 0.0
+
+
+def test_a_file_is_of_one_station(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Changes of one would be taken for changes of the state that the other wrote."""
+    monkeypatch.setattr(recording, "IN_USE_S", 0.0)
+    file = tmp_path / "replay"
+    with closing(open_records(None, file)) as first:
+        first.add(START, {"robots": {}}, whole=True)
+        with closing(open_records(None, file)) as second:
+            assert second.range() is None
+        assert f"replays are kept in memory only: {file} cannot be used" in caplog.text
+        first.add(START + 1, {"robots": {}}, whole=True)
+    with closing(open_records(None, file)) as again:
+        assert again.range() == (START, START + 1)
+
+
 def test_nothing_is_recorded_before_the_first_state(records: Records) -> None:
     recorder = Recorder(FleetView(), records)
     assert recorder.take(START) is None
@@ -172,13 +226,15 @@ def test_nothing_is_recorded_before_the_first_state(records: Records) -> None:
     assert recorder.records.read(START, 10.0) == []
 
 
-@pytest.mark.parametrize("name", ["text.db", "missing/history.db", "."])
+@pytest.mark.parametrize("is_named", [True, False])
+@pytest.mark.parametrize("name", ["text.db", "text.db/history.db", "."])
 def test_a_file_that_cannot_be_used_does_not_keep_the_station_from_starting(
-    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, name: str, is_named: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A damaged recording for replays must not take the emergency stops with it."""
     (tmp_path / "text.db").write_text("this is text" * 100)
-    with closing(open_records(tmp_path / name)) as records:
+    file = tmp_path / name
+    with closing(open_records(file) if is_named else open_records(None, file)) as records:
         records.add(START, {"robots": {}}, whole=True)
         assert records.range() == (START, START)
     assert "replays are kept in memory only" in caplog.text
