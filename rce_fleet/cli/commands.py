@@ -1,4 +1,4 @@
-"""``rce fleet``: robots and events; tasks, zones and blocked places have modules of their own."""
+"""``rce fleet``: robots and events; tasks, zones, places and what is blocked have modules of their own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce.printable import for_terminal, one_line
-from rce_fleet.cli import blocking, tasks, zones
+from rce_fleet.cli import blocking, places, tasks, zones
 from rce_fleet.cli.access import (
     STATION,
     AsJson,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True)
 app.add_typer(tasks.app, name="task")
 app.add_typer(zones.app, name="zone")
+app.add_typer(places.app, name="place")
 app.command("tasks")(tasks.tasks)
 
 
@@ -58,11 +59,16 @@ def _check_choice(robot: str, *, is_all: bool) -> None:
 
 
 @app.command("robots")
-def robots(json_: AsJson = False, station: Station = STATION) -> None:
+def robots(
+    state: Annotated[str, typer.Option(help="States, separated by commas (default: all).")] = "",
+    activity: Annotated[str, typer.Option(help="Activities, separated by commas (default: all).")] = "",
+    json_: AsJson = False,
+    station: Station = STATION,
+) -> None:
     """List robots with their tasks and batteries."""
 
     async def work(client: FleetClient) -> None:
-        found = await client.robots()
+        found = await client.robots(states=_words(state), activities=_words(activity))
         if json_:
             echo_json(found)
             return
@@ -75,6 +81,10 @@ def robots(json_: AsJson = False, station: Station = STATION) -> None:
         echo_table(("robot", "state", "activity", "cell", "goal", "battery", "tasks", "reason"), rows)
 
     do(station, work)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 @app.command("send")
@@ -211,19 +221,23 @@ def watch(
 @app.command("history")
 def history(
     hours: Annotated[float, typer.Option(help="How far back.", min=0.0)] = 24.0,
+    kind: Annotated[
+        str, typer.Option(help="Kinds of events, such as task,zone, separated by commas (default: all).")
+    ] = "",
+    robot: Annotated[str, typer.Option(help="Only events in which this robot took part.")] = "",
     json_: AsJsonLines = False,
     station: Station = STATION,
 ) -> None:
     """Print what happened as CSV."""
 
     async def work(client: FleetClient) -> None:
-        since = max(0.0, time.time() - 3600.0 * hours)
+        since, kinds = max(0.0, time.time() - 3600.0 * hours), _words(kind)
         if json_:
-            async for event in client.history(since=since):
+            async for event in client.history(since=since, kinds=kinds, robot=robot):
                 echo_json_line(event)
             return
         shows = for_terminal if sys.stdout.isatty() else str
-        async for line in client.history_csv(since=since):
+        async for line in client.history_csv(since=since, kinds=kinds, robot=robot):
             typer.echo(shows(line), nl=False)
 
     do(station, work)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable
+from urllib.parse import urlencode
 
 from rce_fleet.api.fleet import EventModel, EventPage, StatisticsModel
 from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookModel, WebhookRequest
@@ -11,6 +12,16 @@ from rce_fleet.client.requests import ApiRequests, parsed, path_part
 
 PAGE = 1000
 """Events of one answer."""
+
+
+def _history_query(
+    since: float | None, until: float | None, subject: str, kinds: Iterable[str], robot: str
+) -> dict[str, str]:
+    """Return the parameters of a request for a part of the history."""
+    times = {"since": since, "until": until}
+    query = {name: repr(value) for name, value in times.items() if value is not None}
+    given = {"id": subject, "kind": ",".join(kinds), "robot": robot}
+    return query | {name: text for name, text in given.items() if text}
 
 
 class HistoryRequests(ApiRequests):
@@ -50,10 +61,7 @@ class HistoryRequests(ApiRequests):
                 print(event.text)
             ```
         """
-        times = {"since": since, "until": until}
-        query = {name: repr(value) for name, value in times.items() if value is not None}
-        given = {"id": subject, "kind": ",".join(kinds), "robot": robot}
-        query |= {"limit": str(PAGE)} | {name: text for name, text in given.items() if text}
+        query = {"limit": str(PAGE)} | _history_query(since, until, subject, kinds, robot)
         while True:
             page = await self._read("/history", EventPage, query)
             for event in page.events:
@@ -63,22 +71,30 @@ class HistoryRequests(ApiRequests):
             query["after"] = str(page.next)
 
     async def history_csv(
-        self, *, since: float | None = None, until: float | None = None
+        self,
+        *,
+        since: float | None = None,
+        until: float | None = None,
+        subject: str = "",
+        kinds: Iterable[str] = (),
+        robot: str = "",
     ) -> AsyncIterator[str]:
         """Yield the lines of the history as CSV, the names of the columns first.
 
         Args:
             since: Seconds since 1970; None: from the beginning.
             until: Seconds since 1970; None: until now.
+            subject: Only events of this task, robot or zone.
+            kinds: Only events of these kinds, such as ``task``; empty: all.
+            robot: Only events in which this robot took part.
 
         Example:
             ```python
             lines = [line async for line in fleet.history_csv(since=time.time() - 86400)]
             ```
         """
-        times = {"since": since, "until": until}
-        query = "&".join(f"{name}={value!r}" for name, value in times.items() if value is not None)
-        path = f"/history?format=csv{'&' if query else ''}{query}"
+        query = {"format": "csv"} | _history_query(since, until, subject, kinds, robot)
+        path = f"/history?{urlencode(query)}"
         async for line in self._transport.stream(path, accept="text/csv", headers={}):
             yield line.decode(errors="replace")
 

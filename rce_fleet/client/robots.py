@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from typing import Literal
 
 from pydantic import BaseModel
@@ -22,8 +23,14 @@ class _Reached(BaseModel):
 class RobotRequests(ApiRequests):
     """Reads robots, pauses them, takes them out of service and sends them by hand."""
 
-    async def robots(self) -> list[FleetRobotModel]:
-        """Return all robots.
+    async def robots(
+        self, *, states: Iterable[str] = (), activities: Iterable[str] = ()
+    ) -> list[FleetRobotModel]:
+        """Return robots by name.
+
+        Args:
+            states: Only those in one of these states, such as ``driving``; empty: all.
+            activities: Only those with one of these activities, such as ``charging``; empty: all.
 
         Example:
             ```python
@@ -31,7 +38,8 @@ class RobotRequests(ApiRequests):
             ```
         """
         robots: list[FleetRobotModel] = []
-        query = {"limit": "500"}
+        wanted = {"state": ",".join(states), "activity": ",".join(activities)}
+        query = {"limit": "500"} | {name: text for name, text in wanted.items() if text}
         while True:
             page = await self._read("/robots", RobotList, query)
             robots += page.robots

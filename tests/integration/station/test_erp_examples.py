@@ -72,7 +72,7 @@ async def check_commands(url: str, folder: Path) -> None:
     lines = [
         line[2:] for line in block("console", "$ rce fleet").splitlines() if line.startswith("$ rce fleet")
     ]
-    assert len(lines) == 22
+    assert len(lines) == 24
     said = {}
     for line in lines:
         words = [waiting if word == "T1" else word for word in shlex.split(line.partition(" > ")[0])]
@@ -90,6 +90,8 @@ async def check_commands(url: str, folder: Path) -> None:
     assert said["block 26"].startswith("cell 26 is blocked until ")
     assert said["block 33>34"].startswith("the move 33>34 is blocked for Robot1 until ")
     assert said["free 17"] == "cell 17 is free\ncell 26 is free\nthe move 33>34 is free\n"
+    assert said["place add"] == "charger: 56 63\n"
+    assert said["place list"].splitlines()[0].split() == ["cell", "kind", "robot"]
     assert said["history --hours"].startswith("number,time,kind")
 
 

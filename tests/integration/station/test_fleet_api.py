@@ -220,6 +220,9 @@ async def check_events(fleet: ManagedFleet) -> None:
         lines = [line async for line in client.history_csv()]
         assert lines[0].startswith("number,time,kind,id,name,state,robot,user,text")
         assert len(lines) - 1 >= len(seen)
+        only = [line async for line in client.history_csv(subject=task.id, kinds=("task", "zone"))]
+        assert len(only) - 1 == len([event async for event in client.history(subject=task.id)])
+        assert [line async for line in client.history_csv(kinds=["zone"])] == lines[:1]
 
 
 async def check_client(fleet: ManagedFleet) -> None:
