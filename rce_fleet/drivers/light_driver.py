@@ -128,19 +128,26 @@ class LightDriver:
         if not self._topics:
             return
         now, stamp = self._robots.time, self._now()
+        present = self._robots.present
         for row in ended:
-            if row in self._topics:
+            if row in self._topics and present[row]:
                 self._publish_results(row, stamp)
         self._publish_poses(now, stamp)
         clock, least = monotonic(), STATUS_EVERY - 1e-6
         due = np.flatnonzero((now - self._listed_at >= least) | (clock - self._listed_by_clock >= least))
         self._listed_at[due], self._listed_by_clock[due] = now, clock
-        for row in self._rows[due].tolist():
+        for row in self._present(due):
             self._publish_status(row, stamp)
         due = np.flatnonzero(now - self._measured_at >= BATTERY_EVERY - 1e-6)
         self._measured_at[due] = now
-        for row in self._rows[due].tolist():
+        for row in self._present(due):
             self._publish_battery(row, stamp)
+
+    def _present(self, due: NDArray[np.int64]) -> list[int]:
+        """Return the rows of robots that are due, without those that were removed: these are silent."""
+        rows = self._rows[due]
+        found: list[int] = rows[self._robots.present[rows]].tolist()
+        return found
 
     def _publish_battery(self, row: int, stamp: Time) -> None:
         batteries, topic = self._robots.batteries, self._topics[row].battery
@@ -173,7 +180,10 @@ class LightDriver:
         away = poses - self._shown
         far = (np.hypot(away[:, 0], away[:, 1]) >= UPDATE_MIN_D) | (np.abs(away[:, 2]) >= UPDATE_MIN_A)
         stopped = self._moved & ~moving
-        due = np.flatnonzero((moving & far) | stopped | (now - self._shown_at >= POSE_EVERY))
+        due = np.flatnonzero(
+            ((moving & far) | stopped | (now - self._shown_at >= POSE_EVERY))
+            & self._robots.present[self._rows]
+        )
         self._moved = moving
         self._shown[due], self._shown_at[due] = poses[due], now
         for row, (x, y, yaw) in zip(self._rows[due].tolist(), poses[due].tolist(), strict=True):

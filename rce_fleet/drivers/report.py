@@ -126,7 +126,7 @@ def _light_robots(world: World) -> list[RobotTruth]:
     if light is None:
         return []
     found = []
-    for row, name in enumerate(light.names):
+    for row, name in light.present_names.items():
         pose = light.pose(row)
         found.append(
             RobotTruth(

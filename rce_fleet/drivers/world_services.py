@@ -190,10 +190,8 @@ class WorldServices:
             self._runner.world.take_box(name)
         elif name in self._runner.world.walkers:
             self._runner.world.remove_walker(name)
-        elif (light := self._runner.world.light) is not None and light.row(name) is not None:
-            return _refused(
-                f"{name} is a light robot: it stays while the world runs; take it out of service, or move it"
-            )
+        elif (light := self._runner.world.light) is not None and (row := light.row(name)) is not None:
+            light.remove(row)
         else:
             return _refused(self._unknown(name))
         return _done(f"{name} was removed")
@@ -245,7 +243,8 @@ class WorldServices:
         world = self._runner.world
         found = [(name, (robot.pose, robot.twist)) for name, robot in world.robots.items()]
         if (light := world.light) is not None:
-            found += [(name, (light.pose(row), light.twist(row))) for row, name in enumerate(light.names)]
+            present = light.present_names.items()
+            found += [(name, (light.pose(row), light.twist(row))) for row, name in present]
         found += [(name, (box.pose, Twist())) for name, box in world.all_boxes.items()]
         found += [(name, (Pose(*each.position, 0.0), Twist())) for name, each in world.walkers.items()]
         return found
@@ -260,7 +259,8 @@ class WorldServices:
         """Publish what there is, if that changed."""
         world, paused = self._runner.world, self._runner.paused
         things: dict[str, list[Any]] = {name: ["robot"] for name in world.robots}
-        things |= {name: ["light"] for name in (() if world.light is None else world.light.names)}
+        light = {} if world.light is None else world.light.present_names
+        things |= {name: ["light"] for name in light.values()}
         things |= {name: ["box", box.width, box.depth] for name, box in world.all_boxes.items()}
         things |= {name: ["walker", walker.spec.radius] for name, walker in world.walkers.items()}
         text = json.dumps({"paused": paused, "things": things}, separators=(",", ":"))

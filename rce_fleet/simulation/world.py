@@ -506,7 +506,7 @@ class World:
         robots = [(robot.id, *robot.place[:2], robot.radius) for robot in self._robots.values()]
         walkers = [(walker.id, *walker.position, walker.spec.radius) for walker in self._walkers.values()]
         light = [] if self.light is None else self.light.discs.tolist()
-        names = () if self.light is None else self.light.names
+        names = () if self.light is None else self.light.present_names.values()
         return robots + walkers + [(name, *disc) for name, disc in zip(names, light, strict=True)]
 
     def _near(self, block: Block, apart: float) -> tuple[str, ...]:

@@ -107,6 +107,20 @@ class ContactJudge:
         """Take other edges; as for the constructor."""
         self._raster, self._is_wall = EdgeRaster(edges, self._reach), is_wall
 
+    def leave_out(self, disc: int) -> None:
+        """Leave a disc out from the next update on: the numbers of those after it are one less then."""
+
+        def moved(numbers: set[int]) -> set[int]:
+            return {number - (number > disc) for number in numbers - {disc}}
+
+        def moved_first(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+            return {(first - (first > disc), other) for first, other in pairs if first != disc}
+
+        pairs = {(first, second - (second > disc)) for first, second in self._pairs if second != disc}
+        self._pairs = moved_first(pairs)
+        self._at_walls, self._at_boxes = moved(self._at_walls), moved(self._at_boxes)
+        self._at_walkers, self._at_doors = moved_first(self._at_walkers), moved_first(self._at_doors)
+
     def update(self, places: Floats, radii: Floats, judged: int | None = None) -> None:
         """Judge the discs where they are now.
 

@@ -63,7 +63,8 @@ class LightRobots:
         seed: Seed of the noise.
 
     Attributes:
-        names: The robots' ids, in the order of their rows.
+        names: The ids of all robots, in the order of their rows.
+        present: Which robots are in the world, shape (N,); those that were removed keep their rows.
         bodies: Their places and speeds.
         batteries: Their batteries.
         steering: Their controllers.
@@ -88,6 +89,7 @@ class LightRobots:
     ) -> None:
         self.names = tuple(starts)
         self.model = model or LightModel()
+        self.present: NDArray[np.bool_] = np.ones(len(self.names), np.bool_)
         self._rows = {name: row for row, name in enumerate(self.names)}
         self._walls, self._boxes = edges, np.empty((0, 4))
         self.bodies = LightBodies(list(starts.values()), self.model, seed)
@@ -108,14 +110,20 @@ class LightRobots:
         return len(self.names)
 
     def row(self, robot: str) -> int | None:
-        """Return the row of a robot; None if it is not one of these."""
-        return self._rows.get(robot)
+        """Return the row of a robot; None if it is not one of these, or was removed."""
+        row = self._rows.get(robot)
+        return None if row is None or not self.present[row] else row
+
+    @property
+    def present_names(self) -> dict[int, str]:
+        """The ids of the robots that are present, by their rows in growing order."""
+        return {row: self.names[row] for row in np.flatnonzero(self.present).tolist()}
 
     @property
     def discs(self) -> Floats:
-        """Where the robots are, shape (N, 3): x, y and radius, metres."""
-        radii = np.full((len(self), 1), self.model.radius)
-        return np.concatenate((self.bodies.poses[:, :2], radii), axis=1)
+        """Where the robots are that are present, shape (P, 3): x, y and radius, metres."""
+        places = self.bodies.poses[self.present, :2]
+        return np.concatenate((places, np.full((len(places), 1), self.model.radius)), axis=1)
 
     def pose(self, row: int) -> Pose:
         """Return the true pose of a robot."""
@@ -134,7 +142,7 @@ class LightRobots:
         self.batteries = LightBatteries(len(self), self.model.battery)
         self.steering = Steering(len(self), limits_of(self.model))
         self.steering.speed_limits = self.speed_limits
-        self._powered = np.ones((len(self), 1), np.bool_)
+        self._powered = self.present[:, np.newaxis]
         self.goal_lists = [GoalList() for _ in self.names]
         self._busy: set[int] = set()
         self._by_hand: dict[int, tuple[float, float, float]] = {}
@@ -151,6 +159,14 @@ class LightRobots:
     def put(self, row: int, pose: Pose, *, as_start: bool = False) -> None:
         """Put a robot elsewhere, as a hand would; ``as_start``: it also stands there after a reset."""
         self.bodies.put(row, pose, as_start=as_start)
+
+    def remove(self, row: int) -> None:
+        """Take a robot out of the world for good: it stands, nothing meets it, and its goals end."""
+        self.judge.leave_out(int(np.count_nonzero(self.present[:row])))
+        self.present[row] = False
+        self.cancel(row, "", 0.0)
+        self.bodies.speeds[row] = 0.0
+        self._powered = self._powered & self.present[:, np.newaxis]
 
     # Goals
 
@@ -227,19 +243,20 @@ class LightRobots:
             self.bodies.step(self._commands() * self._powered, TIME_STEP)
             if self._steps % BATTERY_STEPS == 0:
                 self._drain(BATTERY_STEPS * TIME_STEP)
-            discs = np.concatenate((self.discs, self.others)) if len(self.others) else self.discs
-            self.judge.update(discs[:, :2], discs[:, 2], len(self))
+            own = self.discs
+            discs = np.concatenate((own, self.others)) if len(self.others) else own
+            self.judge.update(discs[:, :2], discs[:, 2], len(own))
             if len(self.walkers) or self.doors:
-                self.judge.update_moving(
-                    discs[: len(self), :2], discs[: len(self), 2], self.walkers, self.doors
-                )
+                self.judge.update_moving(own[:, :2], own[:, 2], self.walkers, self.doors)
             if self.judge.began and len(self.contacts) < _CONTACTS:
                 self._note_contacts()
 
     def _note_contacts(self) -> None:
-        for row, other in sorted(self.judge.began):
+        rows = np.flatnonzero(self.present).tolist()
+        for disc, other in sorted(self.judge.began):
+            row = rows[disc]
             x, y = self.bodies.poses[row, :2].tolist()
-            name = self.names[other] if other < len(self) else ""
+            name = self.names[rows[other]] if other < len(rows) else ""
             self.contacts.append(LightContact(self._steps * TIME_STEP, self.names[row], name, x, y))
 
     def _drain(self, seconds: float) -> None:
@@ -249,7 +266,7 @@ class LightRobots:
             away = np.hypot(self.bodies.poses[:, 0] - x, self.bodies.poses[:, 1] - y)
             docked |= away <= reach
         self.batteries.step(seconds, self.bodies.speeds, docked)
-        self._powered = ~self.batteries.empty[:, np.newaxis]
+        self._powered = (self.present & ~self.batteries.empty)[:, np.newaxis]
 
     def _solid(self) -> tuple[Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
         """Return all edges, and which of them are walls."""

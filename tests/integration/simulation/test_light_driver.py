@@ -13,7 +13,7 @@ from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
-from rce_fleet.drivers.light_driver import LightDriver
+from rce_fleet.drivers.light_driver import POSE, LightDriver
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.light.robots import LightRobots
 
@@ -52,7 +52,10 @@ async def test_light_robots_obey_stops_and_hands() -> None:
 
 
 async def test_robots_of_a_slow_world_stay_heard() -> None:
-    """A world at a quarter of real time sent a status every 4 s; the fleet took robots for silent."""
+    """A world at a quarter of real time sent a status every 4 s; the fleet took robots for silent.
+
+    A robot that was removed is silent.
+    """
     robots = LightRobots({"Robot1": Pose(0, 0, 0), "Robot2": Pose(0, 5, 0)}, np.empty((0, 4)))
     async with (
         Core(port=0) as core,
@@ -61,11 +64,15 @@ async def test_robots_of_a_slow_world_stay_heard() -> None:
     ):
         driver = LightDriver(node, robots, range(2))
         await driver.start()
+        robots.remove(1)
         heard: list[float] = []
+        removed: list[Message] = []
 
         def hear(_: Message) -> None:
             heard.append(robots.time)
 
+        for topic, type_name in (("move_base/status", "actionlib_msgs/GoalStatusArray"), ("amcl_pose", POSE)):
+            await client.subscribe(f"/Robot2/{topic}", type_name, removed.append)
         await client.subscribe("/Robot1/move_base/status", "actionlib_msgs/GoalStatusArray", hear)
 
         def update() -> bool:
@@ -75,6 +82,7 @@ async def test_robots_of_a_slow_world_stay_heard() -> None:
 
         await until(update)
         assert robots.time < 2
+        assert not removed
 
 
 async def test_topics_of_many_robots_are_registered_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,13 +73,15 @@ async def test_an_operator_changes_a_simulated_world(tmp_path: Path) -> None:
                 await asyncio.sleep(0.05)
         with pytest.raises(WorldError, match="box9"):
             await world.act(WorldRequest(action="remove", name="box9"))
-        with pytest.raises(WorldError, match="a light robot: it stays"):
-            await world.act(WorldRequest(action="remove", name="Light1"))
         said = await world.act(WorldRequest(action="add_robot", name="Robot9", x=6, y=6))
         assert "connect it to the fleet" in said
         await world.act(WorldRequest(action="reset"))
         await until_place("Robot1", 1, 1)
         await check_starts(world, until_place, until_told)
+        await world.act(WorldRequest(action="remove", name="Light1"))
+        await until_told("Light1", None, paused=False)
+        with pytest.raises(WorldError, match="Light1"):
+            await world.act(WorldRequest(action="move", name="Light1", x=2, y=2))
     finally:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)

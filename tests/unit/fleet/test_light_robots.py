@@ -229,6 +229,45 @@ def test_light_robots_share_a_world_with_others() -> None:
     assert light.pose(0) == Pose(*world.grid.centre(52), 0.0)
 
 
+def test_a_removed_robot_meets_and_obeys_nothing() -> None:
+    """The contacts of the others are counted as before, under their own names."""
+    starts = {f"Robot{number}": Pose(2.0 * number, 0, 0) for number in range(1, 5)}
+    robots = LightRobots(starts, NO_EDGES, EXACT)
+    robots.put(3, Pose(6.3, 0, 0))  # Robot4 and Robot3 touch
+    robots.accept(1, "a", 1.0, 9.0, 0.0)
+    robots.advance(0.2)
+    assert (robots.judge.with_robots, robots.row("Robot2")) == (1, 1)
+    robots.remove(1)
+    assert (robots.row("Robot2"), len(robots.discs)) == (None, 3)
+    assert robots.present_names == {0: "Robot1", 2: "Robot3", 3: "Robot4"}
+    before = robots.bodies.poses[1].tolist()
+    robots.accept(1, "b", 2.0, 9.0, 0.0)
+    robots.advance(1.0)
+    robots.drive(1, 0.5, 0.0)
+    robots.advance(1.0)
+    assert robots.bodies.poses[1].tolist() == before
+    robots.accept(0, "a", 1.0, 5.85, 0.0)  # through the place of Robot2, and to Robot3
+    robots.advance(12.0)
+    assert robots.judge.with_robots == 2
+    assert [(contact.robot, contact.other) for contact in robots.contacts[1:]] == [("Robot1", "Robot3")]
+    robots.reset()
+    robots.accept(1, "c", 3.0, 9.0, 0.0)
+    robots.advance(2.0)
+    assert (robots.row("Robot2"), robots.bodies.poses[1, 0]) == (None, 4.0)
+
+
+def test_a_removed_robot_leaves_its_place_free() -> None:
+    world = World(GridMap(10, 10))
+    place = Pose(*world.grid.centre(52), 0.0)
+    light = world.add_light_robots({"Robot1": place})
+    with pytest.raises(PlaceTakenError):
+        world.place_robot("Robot2", place)
+    light.remove(0)
+    world.place_robot("Robot2", place)
+    world.step(1.0)
+    assert world.collisions.total == 0
+
+
 def test_a_robot_keeps_to_the_limit_of_its_speed() -> None:
     robots = LightRobots({"Slow": Pose(1, 1, 0), "Fast": Pose(1, 3, 0)}, NO_EDGES, EXACT)
     robots.limit_speed(0, 0.2)
