@@ -25,6 +25,7 @@ export class WorldPanel {
     this.operator = operator;
     this.steers = true;
     this.note = document.querySelector("#simulation-note");
+    this.outside = document.querySelector("#simulation-outside");
     document.querySelector("#views").hidden = false;
     for (const name of ["map", "both", "world"]) document.querySelector(`#view-${name}`).addEventListener("click", () => this.show(name));
     const { canvas } = world;
@@ -35,6 +36,7 @@ export class WorldPanel {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.#key(event));
     for (const type of ["world", "things"]) fleet.addEventListener(type, () => this.#drawState());
+    for (const type of ["things", "state", "changes"]) fleet.addEventListener(type, () => this.#tellOutside());
     const buttons = document.querySelector("#simulation-buttons");
     for (const action of ["pause", "resume", "reset", ...PICKS]) {
       const button = element("button", t(`simulation.${action}`));
@@ -57,6 +59,14 @@ export class WorldPanel {
   #tell() {
     const text = t(this.#pick ? `simulation.${this.#pick}.hint` : this.fleet.isPaused ? "simulation.starts" : "simulation.help");
     if (this.note.textContent !== text) this.note.textContent = text;
+  }
+
+  // Robots that the fleet does not have: nothing else on the page shows them.
+  #tellOutside() {
+    const { things, robots } = this.fleet;
+    const outside = Object.keys(things).filter((name) => things[name][0] === "robot" && !robots.has(name));
+    const text = outside.length ? t("simulation.outside", { robots: outside.join(", ") }) : "";
+    if (this.outside.textContent !== text) this.outside.textContent = text;
   }
 
   show(name) {
