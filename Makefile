@@ -11,7 +11,7 @@ PARALLEL := -n auto --dist loadgroup --durations=25
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help packages install demo test test-all collect test-quick fuzz faults moments wheel lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all collect test-quick fuzz faults moments kills wheel lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -20,6 +20,7 @@ help:
 	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
 	@echo "make faults  kill, cut off and slow down masters and etcd; ARGS=\"--only kill --rounds 100 --seed 7\""
 	@echo "make moments  end rce up at random moments by random signals; COUNT=200 times, SEED=1"
+	@echo "make kills   kill planner and fleet manager under load: KILLS=20 times, some minutes"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make docs    the documentation as a site, in build/docs; needs no network"
@@ -64,6 +65,10 @@ faults: install
 
 moments: install
 	PYTHONPATH=tests $(BIN)/python -m support.moments $(or $(SEED),1) $(or $(COUNT),200)
+
+kills: install
+	RCE_KILLS=$(or $(KILLS),20) $(BIN)/python -m pytest -s --timeout 3600 \
+		tests/integration/fleet_nodes/test_fleet_manager_killed.py $(ARGS)
 
 test-quick: install
 	$(BIN)/python -m pytest -n logical -m "not slow" --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)

@@ -1,6 +1,6 @@
 """Planner and fleet manager are killed under load: no task is lost, none runs twice.
 
-``RCE_KILLS=20`` makes so many kills instead of a few, ``-s`` prints the counts.
+``make kills`` makes 20 kills instead of a few (``RCE_KILLS``), and prints the counts (``-s``).
 """
 
 from __future__ import annotations
