@@ -19,6 +19,8 @@ InterfaceT = TypeVar("InterfaceT", bound="ClientInterface")
 
 Json = dict[str, Any]
 """A message as an object of its fields; binary values are bytes-like."""
+QUEUE_SIZE = 64
+"""Messages that wait for a coroutine function or an iteration, unless a program says how many."""
 Serialized = bytes | bytearray | memoryview
 """A serialized ROS message. A received one is a memoryview of its frame, not a copy."""
 
@@ -54,8 +56,9 @@ class OwnInterfaces:
             tag: Interface tag.
             message_type: Message type, ``package/Type``.
             raw: Messages are serialized ROS messages (a Forwarder) instead of objects (a Converter).
-            queue_size: How many messages may wait on a slow connection; a full queue drops the oldest. 1 is
-                for commands of which only the newest counts. None: as many as the connection's limits allow.
+            queue_size: How many messages may wait here, and on their way in the engine; a full queue drops
+                the oldest. 1 is for commands of which only the newest counts. None: as many as the limits
+                allow.
 
         Raises:
             InterfaceError: This program already has an interface with this tag.
@@ -70,9 +73,8 @@ class OwnInterfaces:
             names.publish({"data": "Ada"})
             ```
         """
-        return await self._open(
-            Publisher[Any](self._session, tag, message_type, raw=raw, queue_size=queue_size)
-        )
+        publisher = Publisher[Any](self._session, tag, message_type, raw=raw, queue_size=queue_size)
+        return await self._open(publisher, queue_size or 0)
 
     @overload
     async def subscriber(
@@ -81,7 +83,7 @@ class OwnInterfaces:
         message_type: str,
         callback: Callable[[Json], Awaitable[None] | None] | None = None,
         *,
-        queue_size: int = ...,
+        queue_size: int | None = ...,
         latches: LatchListener[Json] | None = ...,
     ) -> Subscriber[Json]: ...
     @overload
@@ -92,7 +94,7 @@ class OwnInterfaces:
         callback: Callable[[Serialized], Awaitable[None] | None] | None = None,
         *,
         raw: Literal[True],
-        queue_size: int = ...,
+        queue_size: int | None = ...,
         latches: LatchListener[Serialized] | None = ...,
     ) -> Subscriber[Serialized]: ...
     async def subscriber(
@@ -102,7 +104,7 @@ class OwnInterfaces:
         callback: Callable[[Any], Awaitable[None] | None] | None = None,
         *,
         raw: bool = False,
-        queue_size: int = 64,
+        queue_size: int | None = None,
         latches: LatchListener[Any] | None = None,
     ) -> Subscriber[Any]:
         """Create an interface of this robot that receives messages.
@@ -115,8 +117,9 @@ class OwnInterfaces:
             callback: Called with each message. A plain function must not block; a coroutine function is
                 awaited before the next message. Without a callback, iterate over the subscriber.
             raw: Messages are serialized ROS messages, as for :meth:`publisher`, each a memoryview.
-            queue_size: How many messages may wait for a coroutine function or an iteration; a full queue
-                drops the oldest.
+            queue_size: How many messages may wait in the engine, and here for a coroutine function or an
+                iteration; a full queue drops the oldest. 1 is for commands of which only the newest counts.
+                None: 64 here, and as many as the engine's limits allow.
             latches: Gets the latched messages instead of the callback, if the engine marks them.
 
         Raises:
@@ -133,17 +136,16 @@ class OwnInterfaces:
             await robot.connect("brain/greetings", "testRobot/greetings")
             ```
         """
-        return await self._open(
-            Subscriber[Any](
-                self._session,
-                tag,
-                message_type,
-                raw=raw,
-                callback=callback,
-                queue_size=queue_size,
-                latches=latches,
-            )
+        subscriber = Subscriber[Any](
+            self._session,
+            tag,
+            message_type,
+            raw=raw,
+            callback=callback,
+            queue_size=queue_size or QUEUE_SIZE,
+            latches=latches,
         )
+        return await self._open(subscriber, queue_size or 0)
 
     @overload
     async def service_client(self, tag: str, message_type: str) -> ServiceClient[Json]: ...
@@ -237,15 +239,18 @@ class OwnInterfaces:
             ServiceProvider[Any](self._session, tag, message_type, handler, raw=raw, max_calls=max_calls)
         )
 
-    async def _open(self, interface: InterfaceT) -> InterfaceT:
-        """Ask the engine for an interface."""
+    async def _open(self, interface: InterfaceT, queue_size: int = 0) -> InterfaceT:
+        """Ask the engine for an interface, in whose queues there so many messages may wait."""
         session = self._session
         session.check_open()
         session.interfaces.add(interface)
         added = AddInterface(
             endpoint=self.robot_id,
             interface=InterfaceSpec(
-                tag=interface.tag, type=interface.interface_type, message_type=interface.message_type
+                tag=interface.tag,
+                type=interface.interface_type,
+                message_type=interface.message_type,
+                queue_size=queue_size,
             ),
         )
         try:

@@ -271,7 +271,14 @@ class Requests(ABC):
     # Interfaces and connections
 
     async def add_interface(
-        self, endpoint: str, tag: str, interface_type: str, message_type: str, *, addr: str = ""
+        self,
+        endpoint: str,
+        tag: str,
+        interface_type: str,
+        message_type: str,
+        *,
+        addr: str = "",
+        queue_size: int = 0,
     ) -> None:
         """Create an interface of a container or a robot. Cancelling does not withdraw the request.
 
@@ -287,6 +294,8 @@ class Requests(ABC):
                 or ``Forwarder`` (at a robot), such as ``"PublisherInterface"``.
             message_type: Message or service type, ``package/Type``.
             addr: ROS name of the topic or service; containers need it.
+            queue_size: How many messages of a topic may wait in each of the engine's queues; 1 is for
+                commands of which only the newest counts. 0: as many as its limits allow.
 
         Raises:
             RefusedError: The engine refused this client permanently.
@@ -298,7 +307,9 @@ class Requests(ABC):
             await robot.add_interface("brain", "names", role, "std_msgs/String", addr="/names")
             ```
         """
-        spec = InterfaceSpec(tag=tag, type=interface_type, message_type=message_type, addr=addr)
+        spec = InterfaceSpec(
+            tag=tag, type=interface_type, message_type=message_type, addr=addr, queue_size=queue_size
+        )
         interface = AddInterface(endpoint=endpoint, interface=spec)
         await self.request(ConfigureComponents(add_interfaces=(interface,)))
 

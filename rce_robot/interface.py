@@ -39,8 +39,15 @@ class RobotSide(Protocol):
     def connected(self) -> bool:
         """Whether the robot is connected."""
 
-    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
-        """Send in the data lane; False if the queue refuses or the robot is away."""
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy, queue_size: int = 0) -> bool:
+        """Send in the data lane; False if the queue refuses or the robot is away.
+
+        Args:
+            tag: Of the interface.
+            message: The message.
+            overflow: What its full queue does.
+            queue_size: Messages of the interface that may wait; 0: as many as the limits allow.
+        """
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the robot is away."""

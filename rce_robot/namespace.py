@@ -294,9 +294,9 @@ class Namespace:
         """Whether messages can be sent to the robot."""
         return self._live is not None
 
-    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy, queue_size: int = 0) -> bool:
         """Send in the data lane."""
-        return self._live is not None and self._live.send_data(tag, message, overflow)
+        return self._live is not None and self._live.send_data(tag, message, overflow, queue_size)
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane."""

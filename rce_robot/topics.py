@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rce.guard import Holding
     from rce.link import Port
+    from rce_robot.doors.base import Queued
     from rce_robot.forms import Form
 
 
@@ -197,7 +198,7 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, Delivery(self, payload, NO_ID), shared=True)
         else:
-            self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), OverflowPolicy.DROP_OLDEST)
+            self._send_newest(Delivery(self, payload, NO_ID))
 
     async def _show(self, payload: bytes, source: str) -> tuple[Outgoing | None, str, str]:
         try:
@@ -212,7 +213,11 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, outgoing, shared=False)
         else:
-            self.robot.send_data(self.tag, outgoing, OverflowPolicy.DROP_OLDEST)
+            self._send_newest(outgoing)
+
+    def _send_newest(self, message: Queued) -> None:
+        """Send a message; older ones make room for it where the interface's queue is full."""
+        self.robot.send_data(self.tag, message, OverflowPolicy.DROP_OLDEST, self.port.spec.queue_size)
 
     def _dropped(self) -> None:
         self.robot.count_dropped(self.tag)

@@ -124,11 +124,12 @@ class Channel:
     def _new_queue(self) -> OutgoingQueue:
         limits = self._limits
         service = self.slot.role.is_service
+        queue_size = self.slot.spec.queue_size or limits.queue_messages
         return OutgoingQueue(
             self.number,
             self.slot.counters,
             OverflowPolicy.REFUSE if service else OverflowPolicy.DROP_OLDEST,
-            max_messages=limits.max_calls if service else limits.queue_messages,
+            max_messages=limits.max_calls if service else min(queue_size, limits.queue_messages),
             max_bytes=max(limits.queue_bytes, limits.max_message) if service else limits.queue_bytes,
             backlog=self._backlog,
         )

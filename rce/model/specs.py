@@ -173,6 +173,8 @@ class InterfaceSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Message or service type, ``package/Type``."""
     addr: Annotated[str, _ROS_NAME] = ""
     """ROS name of the topic or service: in the container, or (Forwarders) in the robot's own graph."""
+    queue_size: Annotated[int, _TIMES] = 0
+    """Messages of a topic that may wait in each of the engine's queues; 0: as many as its limits allow."""
 
     @property
     def kind(self) -> InterfaceType:

@@ -85,9 +85,12 @@ async def build(plan: Plan, conn: Connection, node: Node, tasks: TaskScope) -> N
 
 async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> None:
     """Connect one interface with its topic or service. Messages are passed on unchanged."""
+    size = span.queue_size or None
     match span.role:
         case Role.SUBSCRIBER:
-            uplink = Uplink(conn, await conn.publisher(span.tag, span.message_type, raw=True))
+            uplink = Uplink(
+                conn, await conn.publisher(span.tag, span.message_type, raw=True, queue_size=size)
+            )
             if span.on_demand:
                 tasks.spawn(uplink.listen_on_demand(node, span), name=f"uplink {span.tag}")
             else:
@@ -95,7 +98,14 @@ async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> Non
         case Role.PUBLISHER:
             publisher = await _at_master(lambda: node.advertise(span.addr, span.message_type))
             downlink = Downlink(publisher)
-            await conn.subscriber(span.tag, span.message_type, downlink.received, raw=True, latches=downlink)
+            await conn.subscriber(
+                span.tag,
+                span.message_type,
+                downlink.received,
+                raw=True,
+                queue_size=size,
+                latches=downlink,
+            )
         case Role.SERVICE_PROVIDER:
             client = await conn.service_client(span.tag, span.message_type, raw=True)
 

@@ -31,6 +31,8 @@ class Span:
     """Topic or service in the robot's graph."""
     on_demand: bool = False
     """Subscribe to the topic only while the interface is connected: no connection of the file names it."""
+    queue_size: int = 0
+    """Messages that may wait for the network; 0: as many as the limits allow."""
 
     @property
     def type(self) -> str:
@@ -74,6 +76,7 @@ def make_plan(config: ClientConfig) -> Plan:
             own.message_type,
             own.addr,
             on_demand=own.kind.role is Role.SUBSCRIBER and f"{config.robot}/{own.tag}" not in ends,
+            queue_size=own.queue_size,
         )
         for own in config.robot_interfaces
         if own.addr

@@ -88,8 +88,8 @@ class DoorSession(Protocol):
     def spawn(self, work: Coroutine[Any, Any, None]) -> bool:
         """Run a coroutine until the robot leaves; return False if too many run already."""
 
-    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
-        """Send an interface's message when its turn comes."""
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy, queue_size: int = 0) -> bool:
+        """Send an interface's message when its turn comes; of a queue size other than 0, so many wait."""
 
     def send_urgent(self, message: Queued) -> bool:
         """Send a message before all data."""

@@ -36,8 +36,8 @@ WORKER = Worker(FormFactory(TypeRegistry()), 1 << 30)
 
 
 class FakePort:
-    def __init__(self, type_: str, cls: str) -> None:
-        self.spec = InterfaceSpec(tag="tag", type=type_, message_type=cls)
+    def __init__(self, type_: str, cls: str, queue_size: int = 0) -> None:
+        self.spec = InterfaceSpec(tag="tag", type=type_, message_type=cls, queue_size=queue_size)
         self.sent: list[bytes] = []
         self.latched: dict[str, bytes] = {}
         self.answer: bytes | Exception | asyncio.Future[bytes] = b""
@@ -62,6 +62,7 @@ class FakeRobot:
         self.connected = True
         self.room = True
         self.data: list[tuple[Rendered, OverflowPolicy]] = []
+        self.queue_sizes: list[int] = []
         self.urgent: list[Rendered] = []
         self.reports: list[str] = []
         self.states: list[bool] = []
@@ -78,8 +79,9 @@ class FakeRobot:
         self.converting: Callable[[], Awaitable[object]] = lambda: asyncio.sleep(0)
         """What a conversion waits for."""
 
-    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy, queue_size: int = 0) -> bool:
         rendered = message.render()
+        self.queue_sizes.append(queue_size)
         if rendered is not None and self.room:
             self.data.append((rendered, overflow))
         return self.room
@@ -138,8 +140,8 @@ class FakeRobot:
 
 
 class Setup:
-    def __init__(self, type_: str, cls: str = STRING, call_timeout: float = 5.0) -> None:
-        self.port = FakePort(type_, cls)
+    def __init__(self, type_: str, cls: str = STRING, call_timeout: float = 5.0, queue_size: int = 0) -> None:
+        self.port = FakePort(type_, cls, queue_size)
         self.robot = FakeRobot()
         kind = InterfaceType.parse(type_)
         forms = FormFactory(TypeRegistry()).pair(self.port.spec, kind)

@@ -124,15 +124,27 @@ class Outbox:
         return True
 
     def put_data(
-        self, tag: str, message: Queued, overflow: OverflowPolicy = OverflowPolicy.DROP_OLDEST
+        self,
+        tag: str,
+        message: Queued,
+        overflow: OverflowPolicy = OverflowPolicy.DROP_OLDEST,
+        queue_size: int = 0,
     ) -> bool:
-        """Queue a message of the interface ``tag``; its first message settles the queue's ``overflow``.
+        """Queue a message of an interface; its first message settles what a full queue does.
+
+        Args:
+            tag: Of the interface.
+            message: The message.
+            overflow: Whether a full queue drops or refuses.
+            queue_size: Messages that may wait; 0: as many as the limits allow.
 
         Returns:
             False if the queue is full and refuses.
         """
         size = message.size
         flow = self._flow(tag, overflow)
+        if queue_size:
+            flow.queue.max_items = min(queue_size, self._limits.queue_messages)
         if not self._make_room_in(flow, size):
             return False
         while self._data_bytes + size > self._limits.total_bytes and self._drop_of_largest_topic():

@@ -189,12 +189,12 @@ class Session:
 
     # To the robot
 
-    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy, queue_size: int = 0) -> bool:
         """Send in the data lane; False if the queue refuses or the connection ended."""
         if self._socket.writable and not self._outbox:
             self._write(message)
             return True
-        taken = not self.lost and self._outbox.put_data(tag, message, overflow)
+        taken = not self.lost and self._outbox.put_data(tag, message, overflow, queue_size)
         self._owner.grew()
         return taken
 

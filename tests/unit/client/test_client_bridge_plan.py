@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -12,7 +13,13 @@ from rce.config.exceptions import ConfigError
 from rce.model.names import Role
 from rce.model.requests import ConfigureComponents, ConfigureConnections, CreateContainer
 from rce.ros.types import TypeRegistry
+from rce_client.interface_table import InterfaceTable
+from rce_client.own_interfaces import OwnInterfaces
+from rce_client.ros_bridge.bridge import lay
 from rce_client.ros_bridge.plan import check, make_plan
+
+if TYPE_CHECKING:
+    from rce_client.session import Session
 
 STRING = "std_msgs/String"
 
@@ -26,12 +33,48 @@ def config(*interfaces: dict[str, Any], **parts: object) -> ClientConfig:
     return loads(json.dumps({**base, "interfaces": list(interfaces), **parts}))
 
 
+class Engine(OwnInterfaces):
+    """A connection that notes how many messages may wait at the interfaces that are asked for."""
+
+    robot_id = "robot"
+
+    def __init__(self) -> None:
+        self.sizes: dict[str, int] = {}
+        session = SimpleNamespace(
+            check_open=lambda: None,
+            interfaces=InterfaceTable(),
+            request=self._note,
+            is_active=lambda _: False,
+        )
+        self._session = cast("Session", session)
+
+    async def _note(self, request: ConfigureComponents) -> None:
+        self.sizes.update((item.interface.tag, item.interface.queue_size) for item in request.add_interfaces)
+
+
+async def advertise(addr: str, message_type: str) -> object:
+    """Stand for a robot's ROS graph."""
+    return addr, message_type
+
+
 def test_converters_become_forwarders() -> None:
     plan = make_plan(config(own("a", "SubscriberConverter", "/a"), own("b", "PublisherForwarder", "/b")))
     assert [(span.tag, span.role, span.addr, span.type) for span in plan.spans] == [
         ("a", Role.SUBSCRIBER, "/a", "SubscriberForwarder"),
         ("b", Role.PUBLISHER, "/b", "PublisherForwarder"),
     ]
+
+
+async def test_a_queue_size_of_the_file_holds_at_both_ends() -> None:
+    """As for velocities, of which only the newest counts: at the robot's own queue, and in the engine."""
+    up, down = own("up", "SubscriberForwarder", "/up"), own("down", "PublisherForwarder", "/down")
+    other = own("other", "PublisherForwarder", "/other")
+    plan = make_plan(config(up | {"queueSize": 2}, down | {"queueSize": 1}, other))
+    engine, node = Engine(), SimpleNamespace(advertise=advertise)
+    tasks = SimpleNamespace(spawn=lambda work, name: work.close())
+    for span in plan.spans:
+        await lay(span, cast("Any", engine), cast("Any", node), cast("Any", tasks))
+    assert engine.sizes == {"up": 2, "down": 1, "other": 0}
 
 
 def test_containers_first_own_interfaces_left_to_spans() -> None:

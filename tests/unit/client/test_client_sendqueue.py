@@ -62,6 +62,17 @@ async def test_a_queue_of_one_keeps_the_newest() -> None:
     assert drain(queue) == ["3", "1", "2", "3"]
 
 
+async def test_the_newest_velocity_goes_before_a_large_map() -> None:
+    queue = SendQueue(QueueLimits())
+    queue.put_data("map", QueuedMessage.of([bytes(10_000_000)]))
+    for text in ("1", "2"):
+        queue.put_data("velocity", queued(text), queue_size=1)
+    first, second = queue.pop(), queue.pop()
+    assert first is not None
+    assert second is not None
+    assert (first.frames, second.size, queue.pop()) == (["2"], 10_000_000, None)
+
+
 async def test_bytes_are_limited_too_but_one_message_is_always_taken() -> None:
     queue = SendQueue(QueueLimits(topic_bytes=10))
     for text in ("x" * 6, "y" * 6, "z" * 100):

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import contextlib
 from collections import defaultdict
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.aio.queues import OverflowPolicy
+from rce.control.model import ConnectionSpec
+from rce.link.channel import Channel
 from rce.link.exceptions import OverloadedError, ProtocolError
 from rce.link.frame_reader import FrameReader
 from rce.link.frames import FRAGMENT_SIZE, LATCHED, Frame, FrameType, encode_sources, parse_sources
 from rce.link.lanes import MAX_CONTROL_FRAMES, URGENT_BURST, Lanes
 from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue
-from rce.link.settings import LinkLimits
+from rce.link.settings import LinkLimits, LinkTimeouts
+from rce.link.slot import InterfaceSlot
+from rce.model.specs import InterfaceSpec
 
 LIMITS = LinkLimits()
 
@@ -135,6 +141,25 @@ def test_oldest_are_dropped_and_counted() -> None:
     assert queue.head is not None
     assert queue.head.payload == bytes([7] * 4)
     assert queue.counters.dropped == 7
+
+
+@pytest.mark.parametrize(("queue_size", "waiting"), [(0, 64), (1, 1), (1000, 64)])
+def test_interfaces_queue_holds_as_many_as_it_says(queue_size: int, waiting: int) -> None:
+    carrier = SimpleNamespace(send=OutgoingQueue.push)
+    link: Any = SimpleNamespace(limits=LIMITS, carrier=carrier, spec=SimpleNamespace(copy=False))
+    spec = InterfaceSpec(
+        tag="velocity", type="SubscriberInterface", message_type="a/B", queue_size=queue_size
+    )
+    slot = InterfaceSlot(
+        spec, limits=LIMITS, timeouts=LinkTimeouts(), on_change=lambda _: None, on_fault=lambda _: None
+    )
+    end = ConnectionSpec(id=1, link="l", interface="velocity", peer_interface="velocity")
+    channel = Channel(end, slot, link, Backlog())
+    channel.established = True
+    for _ in range(100):
+        channel.send(b"message")
+    assert channel.waiting_bytes == waiting * len(b"message")
+    assert slot.counters.dropped == 100 - waiting
 
 
 def test_bytes_are_bounded_but_one_large_message_may_wait() -> None:

@@ -148,7 +148,7 @@ def test_older_names_stay_on_the_control_channel() -> None:
     interface = filled(AddInterface)
     assert isinstance(interface, AddInterface)
     sent = msgspec.to_builtins(interface.interface)
-    assert sent == {"tag": "x", "type": "PublisherInterface", "cls": "a/B", "addr": "x"}
+    assert sent == {"tag": "x", "type": "PublisherInterface", "cls": "a/B", "addr": "x", "queue_size": 7}
 
 
 @pytest.mark.parametrize("write", [json.dumps, yaml.safe_dump])

@@ -148,6 +148,17 @@ def test_small_messages_pass_large_ones_that_have_credit() -> None:
     assert [text_of(first), drain(outbox)[0]] == ["left0", "drive"]
 
 
+def test_only_the_newest_velocity_waits_and_goes_first() -> None:
+    """Also where a statement about latched sources was the first message of its interface."""
+    outbox = Outbox()
+    outbox.put_latched("velocity", "", message("sources"), shared=False)
+    outbox.put_data("map", message("map", 10_000_000))
+    for number in range(3):
+        outbox.put_data("velocity", message(f"velocity{number}"), queue_size=1)
+    assert drain(outbox) == ["sources", "velocity2", "map"]
+    assert outbox.dropped == {"velocity": 2}
+
+
 def test_small_messages_starve_no_large_one() -> None:
     """A larger one has its turn after each quantum of small ones."""
     outbox = Outbox(OutboxLimits(quantum=1000))

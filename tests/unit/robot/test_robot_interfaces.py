@@ -110,6 +110,13 @@ def test_to_the_robot() -> None:
         setup.take({"data": "x"})
 
 
+@pytest.mark.parametrize("queue_size", [0, 1])
+def test_an_interface_says_how_many_messages_may_wait(queue_size: int) -> None:
+    setup = Setup("PublisherForwarder", queue_size=queue_size)
+    setup.interface.receive(ros_string("x"), latched=False)
+    assert setup.robot.queue_sizes == [queue_size]
+
+
 def test_a_broken_message_of_a_peer_is_told() -> None:
     setup = Setup("PublisherConverter")
     setup.interface.receive(b"no string", latched=False)
