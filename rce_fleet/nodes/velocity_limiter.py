@@ -4,12 +4,15 @@ It subscribes to ``raw_cmd_vel``, ``scan`` and ``odom`` (or tf), and publishes `
 ``speed_limit`` is the highest speed that passes, in m/s, until another comes; 0 ends it. A message true on
 ``emergency_stop``, or the service ``~set_emergency_stop``, stops the robot until false releases it on the
 same way: a release that comes again when a network is back does not end a stop that was made at the robot.
-The work is done by :mod:`rce_fleet.navigation.safety`.
+A time on ``drive_clock``, which a station sends before each velocity of an operator, is answered on
+``drive_echo``; while such times come late, commands are taken for stops. The work is done by
+:mod:`rce_fleet.navigation.safety`.
 """
 
 from __future__ import annotations
 
 from math import isfinite
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,7 @@ from rce_fleet.geometry.jumps import OdometryWatch
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.navigation.costmap.footprint import Footprint
 from rce_fleet.navigation.navigation import read_speed_limit
+from rce_fleet.navigation.safety.drive_clock import DriveClock
 from rce_fleet.navigation.safety.limiter import STANDING, VelocityLimiter, Verdict
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.navigation.safety.seen import Scan, sensor_pose
@@ -60,16 +64,19 @@ class VelocityLimiterNode:
         self._last = Verdict(STANDING)
         self._limited = 0
         self._watch = OdometryWatch()
+        self._drive_clock = DriveClock()
         self._faults: dict[str, str] = {}
         """Why the last scan and the last odometry cannot be used."""
         self._tf: TransformListener
         self._out: Publisher
+        self._echo: Publisher
         self._stopped: Publisher
 
     async def run(self) -> None:
         """Pass commands until the node is stopped."""
         node = self._node
         self._out = await node.advertise("cmd_vel", "geometry_msgs/Twist", queue_size=1)
+        self._echo = await node.advertise("drive_echo", "std_msgs/Float64", queue_size=1)
         self._stopped = await node.advertise("~emergency_stopped", "std_msgs/Bool", latch=True)
         self._stopped.publish(data=False)
         diagnostics = await Diagnostics.start(node, "velocity_limiter: safety")
@@ -85,6 +92,7 @@ class VelocityLimiterNode:
             await node.subscribe("odom", "nav_msgs/Odometry", self._take_odometry)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             await node.subscribe("raw_cmd_vel", "geometry_msgs/Twist", self._take_command)
+            await node.subscribe("drive_clock", "std_msgs/Float64", self._take_clock)
             await node.subscribe("emergency_stop", "std_msgs/Bool", self._take_stop)
             await node.subscribe("speed_limit", "std_msgs/Float64", self._take_speed_limit)
             await node.advertise_service("~set_emergency_stop", "std_srvs/SetBool", self._answer_stop)
@@ -104,8 +112,15 @@ class VelocityLimiterNode:
             self._throttled_log.warn(
                 "command", f"a command of {twist.speed} m/s and {twist.turn_rate} rad/s is taken for a stop"
             )
+        if self._drive_clock.is_late(monotonic()):
+            self._throttled_log.warn("late", "commands of the operator are late: they are taken for stops")
+            twist = STANDING
         self._limiter.take_command(twist, self._node.time())
         self._pass_on()
+
+    def _take_clock(self, message: Message) -> None:
+        if self._drive_clock.take(message.data, monotonic()):
+            self._echo.publish(data=message.data)
 
     def _take_speed_limit(self, message: Message) -> None:
         try:

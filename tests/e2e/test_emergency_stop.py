@@ -24,8 +24,8 @@ from rce.ros.types import TypeRegistry
 from rce_client.connection import Connection
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
-from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
 from rce_fleet.station.commands.sources import CommandError, EngineCommandSource
+from rce_fleet.station.commands.velocity_sender import velocity_sender
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.fleet_link import FleetLink
@@ -69,6 +69,10 @@ async def robot_at_engine() -> AsyncIterator[Site]:
             "initialpose",
             "geometry_msgs/PoseWithCovarianceStamped",
             lambda message: told.append((message.pose.pose.position.x, message.pose.pose.position.y)),
+        )
+        echo = await node.advertise("drive_echo", "std_msgs/Float64")
+        await node.subscribe(
+            "drive_clock", "std_msgs/Float64", lambda message: echo.publish(data=message.data)
         )
         whole = robot_config(1, FleetAccount(url=engine.url))
         kept: dict[str, Any] = {key: whole[key] for key in ("url", "userID", "password", "robotID")}
@@ -122,7 +126,7 @@ async def test_an_emergency_stop_needs_no_planner() -> None:
 
 
 async def test_a_robot_is_driven_and_localized_by_the_engine() -> None:
-    """Once its bridge has ended, the station knows that it does not get velocities any more."""
+    """It answers the time of velocities; once its bridge has ended, the station knows that it gets none."""
     async with (
         robot_at_engine() as site,
         Connection(site.url, "testUser", "testUser", "fleetOperator") as connection,
@@ -136,20 +140,20 @@ async def test_a_robot_is_driven_and_localized_by_the_engine() -> None:
             return (1.5, 2.5) in site.told
 
         await until(localized, what="the robot is told where it is")
-        sender = await control.open("Robot1", VELOCITY)
+        now = asyncio.get_running_loop().time
+        async with velocity_sender(control, "Robot1") as sender:
 
-        async def drives() -> bool:
-            sender.send(velocity_message(0.25, -0.5))
-            return (0.25, -0.5) in site.told
+            async def drives() -> bool:
+                sender.send(0.25, -0.5)
+                return (0.25, -0.5) in site.told and sender.round_trip.seconds(now()) is not None
 
-        async def is_away() -> bool:
-            return not sender.is_connected
+            async def is_away() -> bool:
+                return not sender.is_connected
 
-        await until(drives, what="the robot is driven")
-        assert sender.is_connected
-        await site.bridge.stop()
-        await until(is_away, what="the station knows that the robot is away")
-        await sender.close()
+            await until(drives, what="the robot is driven, and answers")
+            assert sender.is_connected
+            await site.bridge.stop()
+            await until(is_away, what="the station knows that the robot is away")
         await connection.remove_all()
 
 

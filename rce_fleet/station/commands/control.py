@@ -6,7 +6,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import AbstractAsyncContextManager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
@@ -206,6 +206,20 @@ class RobotControl:
             await sender.close()
             raise CommandError(f"nothing of {robot} receives {command.topic}; is the robot connected?")
         return sender
+
+    def listen(
+        self, robot: str, answer: RobotCommand, take: Callable[[float], None]
+    ) -> AbstractAsyncContextManager[None]:
+        """Receive a robot's answers; see :meth:`CommandSource.listen`."""
+        return self._source.listen(robot, answer, take)
+
+    async def open_unconnected(self, robot: str, command: RobotCommand) -> CommandSender:
+        """Return a sender for a topic of a robot, which may not be connected yet; close it at the end.
+
+        Raises:
+            CommandError: The robot does not offer the topic, or cannot be reached.
+        """
+        return await self._source.open(robot, command)
 
     def begin_driving(self, robot: str, user: str) -> bool:
         """Note that a user drives a robot by hand; return False if another one does."""

@@ -1,7 +1,11 @@
-"""The topics of a robot that the station publishes on, without the planner. Pure.
+"""The topics of a robot that the station uses without the planner. Pure.
 
 A robot offers a topic by an interface whose tag is ``command_ROBOT_KEY``, such as
 ``command_Robot1_emergency_stop``, in its own config. The station makes the connection.
+
+While a robot is driven by hand, a time of the station's clock goes with each velocity
+(:data:`DRIVE_CLOCK`), and the robot's safety stage answers it (:data:`DRIVE_ECHO`). So the station knows the
+round trip to the robot, and the stage which velocities are late.
 """
 
 from __future__ import annotations
@@ -21,12 +25,14 @@ class RobotCommand:
         type_name: Type of the messages.
         topic: Its name, without namespace.
         is_latched: Whether a robot that comes later gets the last message.
+        is_answer: Whether the robot publishes, and the station listens.
     """
 
     key: str
     type_name: str
     topic: str
     is_latched: bool = False
+    is_answer: bool = False
 
     def interface_tag(self, robot: str) -> str:
         """Return the tag of the interface that offers this topic of a robot."""
@@ -42,8 +48,10 @@ class RobotCommand:
 EMERGENCY_STOP = RobotCommand("emergency_stop", "std_msgs/Bool", "emergency_stop", is_latched=True)
 VELOCITY = RobotCommand("velocity", "geometry_msgs/Twist", "raw_cmd_vel")
 INITIAL_POSE = RobotCommand("initialpose", "geometry_msgs/PoseWithCovarianceStamped", "initialpose")
+DRIVE_CLOCK = RobotCommand("drive_clock", "std_msgs/Float64", "drive_clock")
+DRIVE_ECHO = RobotCommand("drive_echo", "std_msgs/Float64", "drive_echo", is_answer=True)
 
-COMMANDS = (EMERGENCY_STOP, VELOCITY, INITIAL_POSE)
+COMMANDS = (EMERGENCY_STOP, VELOCITY, INITIAL_POSE, DRIVE_CLOCK, DRIVE_ECHO)
 """All topics that a robot offers to the station."""
 
 POSITION_VARIANCE = 0.25
@@ -65,6 +73,11 @@ def velocity_message(speed: float, turn_rate: float) -> dict[str, Any]:
     }
 
 
+def clock_message(seconds: float) -> dict[str, Any]:
+    """Return a ``std_msgs/Float64``."""
+    return {"data": seconds}
+
+
 def pose_message(x: float, y: float, yaw: float) -> dict[str, Any]:
     """Return a ``geometry_msgs/PoseWithCovarianceStamped`` in the map frame, as rviz publishes it.
 
@@ -82,13 +95,15 @@ def pose_message(x: float, y: float, yaw: float) -> dict[str, Any]:
 
 
 LIGHT_COMMANDS = (EMERGENCY_STOP, VELOCITY)
-"""Those of a light robot, which knows where it is."""
+"""Those of a light robot, which knows where it is, and is driven in the simulation's machine."""
 
 
 def command_interfaces(
     robot: str, namespace: str, commands: Sequence[RobotCommand] = COMMANDS, *, prefix: str = ""
 ) -> Iterator[dict[str, Any]]:
     """Offer a robot's topics to the station, in the form of a client config.
+
+    Of a topic that is not latched only the newest message waits for a slow network.
 
     Args:
         robot: The robot's ID in the engine.
@@ -100,7 +115,8 @@ def command_interfaces(
         yield {
             "eTag": robot,
             "iTag": command.interface_tag(namespace),
-            "iType": "PublisherForwarder",
+            "iType": "SubscriberForwarder" if command.is_answer else "PublisherForwarder",
             "iCls": command.type_name,
             "addr": f"{prefix}/{command.topic}",
+            **({} if command.is_latched else {"queueSize": 1}),
         }

@@ -20,14 +20,14 @@ from rce.web.routes import Route, RouteTable
 from rce_fleet.station.access import EMERGENCY_STOP, IS_CHECKED, USER, AccessControl, problem
 from rce_fleet.station.api import Answer
 from rce_fleet.station.commands.driving import DEAD_S, DriveFrame, DriveGuard
-from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
 from rce_fleet.station.commands.sources import CommandError
+from rce_fleet.station.commands.velocity_sender import velocity_sender
 from rce_fleet.station.planner_client import PlannerError
 
 if TYPE_CHECKING:
     from rce_fleet.station.commands.control import RobotControl
     from rce_fleet.station.commands.manual_mode import ManualHold, ManualModes
-    from rce_fleet.station.commands.sources import CommandSender
+    from rce_fleet.station.commands.velocity_sender import VelocitySender
     from rce_fleet.station.fleet_api import FleetApi
 
 MAX_FRAME = 1 << 12
@@ -194,8 +194,8 @@ class ControlRoutes:
         """Let a page drive a robot over a WebSocket, until it disconnects.
 
         The page sends frames (:class:`DriveFrame`) and gets an answer to each: its number, what the robot was
-        told, and why it stands. The robot stops if no frame comes for 0.4 s. Driving ends when the robot is
-        not manual any more.
+        told, why it stands, and the round trip from the station to the robot. The robot stops if no frame
+        comes for 0.4 s. Driving ends when the robot is not manual any more.
         """
         robot = request.match_info["robot"]
         refusal = self._access.control_refusal(request, "drive", robot)
@@ -243,28 +243,26 @@ class ControlRoutes:
     @contextlib.asynccontextmanager
     async def _sender(
         self, request: web.Request, control: RobotControl, robot: str
-    ) -> AsyncIterator[CommandSender]:
+    ) -> AsyncIterator[VelocitySender]:
         """Give what sends velocities; the robot stands at the end."""
-        sender = await control.open(robot, VELOCITY)
-        self._access.audit(request, "drive", robot, "begin")
-        try:
-            yield sender
-        finally:
-            sender.send(velocity_message(0.0, 0.0))
-            await sender.close()
-            self._access.audit(request, "drive", robot, "end")
+        async with velocity_sender(control, robot) as sender:
+            self._access.audit(request, "drive", robot, "begin")
+            try:
+                yield sender
+            finally:
+                self._access.audit(request, "drive", robot, "end")
 
 
 async def _drive(
     request: web.Request,
     socket: web.WebSocketResponse,
-    sender: CommandSender,
+    sender: VelocitySender,
     hold: ManualHold,
     may_drive: Callable[[], Awaitable[bool]],
     ending: asyncio.Event,
 ) -> None:
     """Pass frames on until the page leaves, the robot has another mode, or user or station end."""
-    guard = DriveGuard()
+    guard = DriveGuard(sender.round_trip)
     reader = asyncio.create_task(_pass_on(request, socket, sender, hold, guard))
     watcher, checker = asyncio.create_task(_stop(sender, hold, guard)), asyncio.create_task(_check(may_drive))
     other, end = asyncio.create_task(hold.until_other_mode()), asyncio.create_task(ending.wait())
@@ -280,7 +278,7 @@ async def _drive(
         why = other.result() if other.done() else ""
     finally:
         await cancel_and_wait(reader, watcher, checker, other, end)
-    sender.send(velocity_message(0.0, 0.0))
+    sender.send(0.0, 0.0)
     if why:
         await _refuse(request, socket, why)
     else:
@@ -288,16 +286,16 @@ async def _drive(
         await close_socket(request, socket, code=WSCloseCode.POLICY_VIOLATION, reason=text)
 
 
-async def _stop(sender: CommandSender, hold: ManualHold, guard: DriveGuard) -> None:
-    """Stop the robot while frames are missing or the planner may drive it, until cancelled."""
+async def _stop(sender: VelocitySender, hold: ManualHold, guard: DriveGuard) -> None:
+    """Stop the robot while frames or answers are missing, or the planner may drive it, until cancelled."""
     loop = asyncio.get_running_loop()
     while True:
         await asyncio.sleep(DEAD_S / 4)
         if guard.check(loop.time()) or _why_not(sender, hold):
-            sender.send(velocity_message(0.0, 0.0))
+            sender.send(0.0, 0.0)
 
 
-def _why_not(sender: CommandSender, hold: ManualHold) -> str:
+def _why_not(sender: VelocitySender, hold: ManualHold) -> str:
     """Return why the robot must stand, whatever the page asks for; empty: it may drive."""
     return hold.why_not or ("" if sender.is_connected else "the robot is not connected")
 
@@ -313,7 +311,7 @@ async def _check(may_drive: Callable[[], Awaitable[bool]]) -> None:
 async def _pass_on(
     request: web.Request,
     socket: web.WebSocketResponse,
-    sender: CommandSender,
+    sender: VelocitySender,
     hold: ManualHold,
     guard: DriveGuard,
 ) -> None:
@@ -326,12 +324,18 @@ async def _pass_on(
             try:
                 frame = DriveFrame.model_validate_json(message.data)
             except ValidationError as error:
-                sender.send(velocity_message(0.0, 0.0))
+                sender.send(0.0, 0.0)
                 await _refuse(request, socket, f"not a frame: {error.errors()[0]['msg']}")
                 break
             speed, turn_rate = guard.take(frame, loop.time(), _why_not(sender, hold))
-            sender.send(velocity_message(speed, turn_rate))
-            answer = {"number": frame.number, "speed": speed, "turn_rate": turn_rate, "reason": guard.reason}
+            sender.send(speed, turn_rate)
+            answer = {
+                "number": frame.number,
+                "speed": speed,
+                "turn_rate": turn_rate,
+                "reason": guard.reason,
+                "robot_round_trip": sender.round_trip.seconds(loop.time()),
+            }
             await socket.send_str(json.dumps(answer))
 
 

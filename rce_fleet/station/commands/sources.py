@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.closing import release
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from rce.ros.node import Node
     from rce.ros.node import Publisher as RosPublisher
     from rce_client.connection import Connection
-    from rce_client.topics import Publisher
+    from rce_client.interfaces import ClientInterface
+    from rce_client.topics import Publisher, Subscriber
     from rce_fleet.station.commands.kinds import RobotCommand
     from rce_fleet.station.layers.ros_source import RosLayerSource
 
@@ -27,6 +28,7 @@ POLL_S = 0.05
 KEEP_S = 1.0
 """How long the master's answer is kept."""
 
+Take = Callable[[float], None]
 ReadItems = Callable[[str], Awaitable[list[dict[str, Any]]]]
 
 
@@ -82,6 +84,19 @@ class CommandSource(ABC):
             CommandError: The robot does not offer the topic, or engine or graph cannot be reached.
         """
 
+    @abstractmethod
+    def listen(self, robot: str, answer: RobotCommand, take: Take) -> AbstractAsyncContextManager[None]:
+        """Receive the numbers that a robot answers with, while the block runs.
+
+        Args:
+            robot: Its ID.
+            answer: The topic.
+            take: Called with each number; must not block.
+
+        Raises:
+            CommandError: The robot does not offer the topic, or engine or graph cannot be reached.
+        """
+
     async def robots(self) -> set[str]:
         """Return robots that offer the emergency stop, also if the planner does not know them; maybe not all.
 
@@ -109,9 +124,7 @@ class EngineCommandSource(CommandSource):
 
     async def open(self, robot: str, command: RobotCommand) -> CommandSender:
         """Connect the station's interface to the robot's."""
-        connection = self._connection()
-        if connection is None:
-            raise CommandError("the engine is not connected")
+        connection = self._connected()
         tag = command.interface_tag(robot)
         endpoints = await self.find(tag, f"{robot} does not offer {command.topic}")
         try:
@@ -127,6 +140,30 @@ class EngineCommandSource(CommandSource):
             await sender.close()  # a tag can be opened once only
             raise
         return sender
+
+    @asynccontextmanager
+    async def listen(self, robot: str, answer: RobotCommand, take: Take) -> AsyncIterator[None]:
+        """Connect the robot's interface to the station's."""
+        connection = self._connected()
+        tag = answer.interface_tag(robot)
+        endpoints = await self.find(tag, f"{robot} does not offer {answer.topic}")
+        async with AsyncExitStack() as stack:
+            try:
+                subscriber: Subscriber[dict[str, Any]] = await connection.subscriber(
+                    tag, answer.type_name, lambda message: take(message["data"]), queue_size=1
+                )
+                stack.push_async_callback(_withdraw, subscriber)
+                for endpoint in endpoints:
+                    await connection.connect(f"{endpoint}/{tag}", f"{connection.robot_id}/{tag}")
+            except ClientError as error:
+                raise CommandError(f"the engine cannot be reached: {error}") from error
+            yield
+
+    def _connected(self) -> Connection:
+        connection = self._connection()
+        if connection is None:
+            raise CommandError("the engine is not connected")
+        return connection
 
     async def robots(self) -> set[str]:
         """Return the robots with an interface for emergency stops."""
@@ -178,6 +215,11 @@ class EngineCommandSource(CommandSource):
             self._reading = None
 
 
+async def _withdraw(interface: ClientInterface) -> None:
+    with suppress(ClientError):
+        await interface.close()
+
+
 def _take_note(reading: asyncio.Task[None]) -> None:
     """Retrieve the error of a reading: those who still wait for it raise it."""
     if not reading.cancelled():
@@ -218,8 +260,7 @@ class _EngineSender(CommandSender):
         return self._connection.is_active(self._publisher.tag)
 
     async def close(self) -> None:
-        with suppress(ClientError):
-            await self._publisher.close()
+        await _withdraw(self._publisher)
 
 
 class RosCommandSource(CommandSource):
@@ -237,6 +278,20 @@ class RosCommandSource(CommandSource):
         sender = _RosSender(self._graphs, robot, command)
         await sender.join()
         return sender
+
+    @asynccontextmanager
+    async def listen(self, robot: str, answer: RobotCommand, take: Take) -> AsyncIterator[None]:
+        """Subscribe to the topic in the robot's graph."""
+        async with AsyncExitStack() as stack:
+            try:
+                node, namespace = await stack.enter_async_context(self._graphs.graph_of(robot))
+                subscriber = await node.subscribe(
+                    f"{namespace}{answer.topic}", answer.type_name, lambda message: take(message.data)
+                )
+            except Exception as error:
+                raise CommandError(f"the ROS graph of {robot} cannot be reached: {error}") from error
+            stack.push_async_callback(release, subscriber)
+            yield
 
     async def robots(self) -> set[str]:
         """Return the robots of the planner's graph that subscribe to emergency stops."""

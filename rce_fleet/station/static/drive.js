@@ -19,6 +19,7 @@ export class Drive {
   #number = 0;
   #sent = new Map();     // number -> when
   #roundTrip = 0;
+  #robotRoundTrip = null;  // from the station to the robot, seconds; null: it does not answer
   #answered = 0;
 
   constructor(fleet) {
@@ -59,6 +60,7 @@ export class Drive {
     this.#sent.clear();
     this.#answered = performance.now();
     this.#roundTrip = 0;
+    this.#robotRoundTrip = null;
     this.error = null;
     // A socket of an earlier drive may close, or tell something, while the next one drives.
     const isMine = () => this.#socket === socket;
@@ -90,18 +92,24 @@ export class Drive {
     for (const number of this.#sent.keys()) if (number <= answer.number) this.#sent.delete(number);
     this.#answered = performance.now();
     if (sent !== undefined) this.#roundTrip = (this.#answered - sent) / 1000;
+    this.#robotRoundTrip = answer.robot_round_trip ?? null;
     this.#showLatency();
     this.state.textContent = answer.reason || t("drive.drives", { speed: answer.speed.toFixed(2), turn: answer.turn_rate.toFixed(2) });
     this.state.className = answer.reason ? "warn" : "good";
   }
 
-  // The way to the station is measured; of the robot only its last sign of life, which the planner heard, is known.
+  // Of a robot that does not answer only its last sign of life, which the planner heard, is known.
   #showLatency() {
     const robot = this.fleet.robots.get(this.robot);
     const age = robot ? heartbeatAge(robot) : null;
-    const ms = Math.round(1000 * this.#roundTrip);
-    this.latency.textContent = age === null ? t("drive.latency.unheard", { ms }) : t("drive.latency", { ms, seconds: age.toFixed(1) });
-    this.latency.className = this.#roundTrip > LATE_S / 2 || age === null || age > OFFLINE_S ? "bad" : "quiet";
+    const ms = (seconds) => Math.round(1000 * seconds);
+    const on = this.#robotRoundTrip;
+    this.latency.textContent = [
+      t("drive.latency", { ms: ms(this.#roundTrip) }),
+      on === null ? t("drive.latency.unmeasured") : t("drive.latency.robot", { ms: ms(on) }),
+      age === null ? t("drive.latency.unheard") : t("drive.latency.heard", { seconds: age.toFixed(1) }),
+    ].join("; ");
+    this.latency.className = this.#roundTrip + (on ?? 0) > LATE_S / 2 || age === null || age > OFFLINE_S ? "bad" : "quiet";
   }
 
   #send() {

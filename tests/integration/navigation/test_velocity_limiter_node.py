@@ -134,6 +134,30 @@ async def test_odometry_that_turns_at_once_forgets_the_scan() -> None:
             assert (await asyncio.wait_for(senses.passed.get(), 30)).speed < 0.2
 
 
+async def test_late_velocities_of_an_operator_are_stops() -> None:
+    """The stage answers the station's clock; while its times come later and later, the robot stands."""
+    async with stage(Transform()) as senses:
+        answers: list[float] = []
+        clock = await senses.node.advertise("drive_clock", "std_msgs/Float64")
+        await senses.node.subscribe("drive_echo", "std_msgs/Float64", lambda said: answers.append(said.data))
+
+        async def come_late() -> None:
+            for number in range(1_000_000):
+                clock.publish(data=1000.0 + 0.01 * number)
+                await asyncio.sleep(EVERY)
+
+        sending = asyncio.create_task(come_late())
+        try:
+            await senses.wait_for(lambda twist: twist == Twist())
+            async with asyncio.timeout(30):
+                while not answers:
+                    await asyncio.sleep(EVERY)
+        finally:
+            sending.cancel()
+        assert 1000.0 <= answers[0] < 1100.0
+        await senses.wait_for(lambda twist: twist == AHEAD)
+
+
 async def test_a_stage_that_ends_early_stops_the_wheels() -> None:
     async with stage(Transform()) as senses:
         senses.stage.cancel()

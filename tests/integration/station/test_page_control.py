@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -154,6 +155,9 @@ async def check_drive(made: Site, page: Page) -> None:
     await made.until(lambda: made.velocities[-1] == pytest.approx((0.0, 0.9), abs=0.05))
     await page.mouse.up()
     await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+    await page.locator("#drive-latency", has_text="to the robot not measured").wait_for()
+    made.answers = True
+    await page.locator("#drive-latency", has_text=re.compile(r"to the robot \d+ ms")).wait_for()
     await page.keyboard.press("Escape")
     await page.locator("#drive").wait_for(state="hidden")
     await made.until(lambda: made.fleet.modes == [("Robot1", "manual"), ("Robot1", "automatic")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -86,6 +87,8 @@ class Site:
     station: Station
     motor: Subscriber | None = None
     """The robot's subscription to velocities."""
+    answers: bool = False
+    """Whether the robot answers the times of velocities."""
     stops: deque[bool] = field(default_factory=deque)
     velocities: deque[tuple[float, float]] = field(default_factory=deque)
     poses: deque[Message] = field(default_factory=deque)
@@ -149,6 +152,13 @@ async def site(authenticator: Authenticator | None = None, robots: int = 2) -> A
                 "geometry_msgs/Twist",
                 lambda said: made.velocities.append((said.linear.x, said.angular.z)),
             )
+            echo = await node.advertise("/Robot1/drive_echo", "std_msgs/Float64")
+
+            def answer(said: Message) -> None:
+                if made.answers:
+                    echo.publish(data=said.data)
+
+            await node.subscribe("/Robot1/drive_clock", "std_msgs/Float64", answer)
             await node.subscribe(
                 "/Robot1/initialpose", "geometry_msgs/PoseWithCovarianceStamped", made.poses.append
             )
@@ -259,6 +269,19 @@ async def _frame(page: ClientWebSocketResponse, number: int, **fields: object) -
     return answer
 
 
+async def _drive_until(
+    page: ClientWebSocketResponse, holds: Callable[[dict[str, Any]], object]
+) -> dict[str, Any]:
+    """Send frames until the answer to one is as expected, and return it."""
+    async with asyncio.timeout(LIMIT_S):
+        for number in itertools.count(round(1000 * asyncio.get_running_loop().time())):
+            answer = await _frame(page, number)
+            if holds(answer):
+                break
+            await asyncio.sleep(0.02)
+    return answer
+
+
 async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
     """It stops when the switch is released, when frames stop, and when the page leaves."""
     async with site() as made:
@@ -290,6 +313,21 @@ async def test_a_robot_that_is_away_is_not_shown_as_driven() -> None:
                     break
                 await asyncio.sleep(0.01)
         assert answer["reason"] == "the robot is not connected"
+
+
+async def test_a_robot_whose_answers_fail_to_come_stands() -> None:
+    """As behind a network with seconds of queue, which the page does not see by itself."""
+    async with site() as made:
+        made.answers = True
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            await _drive_until(page, lambda answer: answer["robot_round_trip"] and answer["speed"] == 0.2)
+            made.answers = False
+            stands = await _drive_until(page, lambda answer: answer["speed"] == 0.0)
+            assert "round trip to the robot" in stands["reason"]
+            made.velocities.clear()
+            await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
+            made.answers = True
+            await _drive_until(page, lambda answer: answer["speed"] == 0.2)
 
 
 async def test_a_station_that_ends_gives_driven_robots_their_modes_back() -> None:

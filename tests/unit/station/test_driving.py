@@ -14,6 +14,7 @@ from rce_fleet.station.commands.driving import (
     ROUND_TRIP_S,
     DriveFrame,
     DriveGuard,
+    RobotRoundTrip,
 )
 
 PAGE_CLOCK = 5000.0
@@ -59,6 +60,41 @@ def test_a_slow_round_trip_stops() -> None:
     guard = DriveGuard()
     assert guard.take(frame(0, round_trip=ROUND_TRIP_S + 0.1), 100.0) == (0.0, 0.0)
     assert "round trip" in guard.reason
+
+
+def test_the_round_trip_goes_on_to_the_robot() -> None:
+    """A network with seconds of queue shows nothing between page and station."""
+    robot = RobotRoundTrip()
+    guard = DriveGuard(robot)
+    robot.sent(100.0)
+    assert guard.take(frame(0), 100.0) == (0.3, -0.2), "a robot that never answers is not measured"
+    robot.answered(100.0, 100.1)
+    robot.sent(100.1)
+    assert guard.take(frame(1, round_trip=0.2), 100.2) == (0.3, -0.2)
+    assert guard.take(frame(2, round_trip=ROUND_TRIP_S - 0.1), 100.3) == (0.0, 0.0)
+    assert guard.reason == "a round trip to the robot takes 0.7 s"
+
+
+def test_a_robot_whose_answer_is_awaited_stops() -> None:
+    """Without a frame, too: the station looks again and again."""
+    robot = RobotRoundTrip()
+    guard = DriveGuard(robot)
+    for number in range(3):
+        robot.sent(100.0 + 0.1 * number)
+    robot.answered(100.0, 100.05)
+    assert robot.seconds(100.2) == pytest.approx(0.1)
+    at = 100.1 + ROUND_TRIP_S
+    guard.take(frame(7), at - 0.01)
+    assert [guard.check(at - 0.01), guard.check(at + 0.01)] == [False, True]
+    robot.answered(100.2, at)
+    assert robot.seconds(at + 1) == pytest.approx(at - 100.2)
+
+
+@pytest.mark.parametrize("sent", [float("nan"), float("-inf"), 200.0])
+def test_an_answer_that_cannot_be_is_ignored(sent: float) -> None:
+    robot = RobotRoundTrip()
+    robot.answered(sent, 100.0)
+    assert robot.seconds(100.0) is None
 
 
 @pytest.mark.parametrize("number", [0, 4, 5])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from rce_fleet.station.commands import control as module
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
 from rce_fleet.station.commands.kinds import EMERGENCY_STOP, INITIAL_POSE, RobotCommand
-from rce_fleet.station.commands.sources import CommandError, CommandSender, CommandSource
+from rce_fleet.station.commands.sources import CommandError, CommandSender, CommandSource, Take
 
 
 class Sender(CommandSender):
@@ -65,6 +66,9 @@ class Robots(CommandSource):
         if robot not in self.here:
             raise CommandError(f"no interface of {robot}")
         return self.senders.setdefault(robot, Sender())
+
+    def listen(self, robot: str, answer: RobotCommand, take: Take) -> AbstractAsyncContextManager[None]:
+        raise NotImplementedError
 
     async def robots(self) -> set[str]:
         return self.listed
