@@ -82,11 +82,14 @@ class FleetRobotModel(ApiModel):
 
 
 class RobotList(ApiModel):
-    """Robots by name: all, or a page of them."""
+    """Robots by name: all, a page of them, or those that changed."""
 
     robots: list[FleetRobotModel]
     next: str | None = Field(
         default=None, description="The cursor of the next page; null: these are the last."
+    )
+    version: int | None = Field(
+        default=None, description="With since: ask with it for robots that change after this answer."
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import asdict, replace
 from itertools import islice
 from typing import get_args
@@ -35,6 +36,8 @@ from rce_fleet.tasks.records import AUTOMATIC, RobotEntry
 MOST_EVENTS = 5000
 MOST_ROBOTS = 1000
 """In one page."""
+MOST_VERSION = 1 << 53
+"""Greatest version of the list of robots, which JavaScript can tell from the next one."""
 _OF_EVENTS = ("id", "kind", "robot")
 """What events can be asked for by."""
 
@@ -43,8 +46,10 @@ _OF_EVENTS = ("id", "kind", "robot")
 
 
 async def robots(call: Call) -> FleetAnswer:
-    """Return robots by name: all, or a page of them; of some states or activities only."""
-    call.only("limit", "cursor", "state", "activity")
+    """Return robots by name: all, or a page of them; of some states or activities only; or changed ones."""
+    call.only("limit", "cursor", "state", "activity", "since")
+    if "since" in call.query:
+        return _changed_robots(call)
     limit, after = call.count("limit", 0, MOST_ROBOTS), call.query.get("cursor", "")
     names = sorted(name for name in {*call.manager.facts.robots, *call.manager.book.robots} if name > after)
     wanted = {field: text.split(",") for field in ("state", "activity") if (text := call.query.get(field))}
@@ -54,6 +59,31 @@ async def robots(call: Call) -> FleetAnswer:
     page = list(islice(fitting, limit or None))
     more = next(fitting, None) is not None
     return shown(RobotList(robots=page, next=page[-1].id if more else None))
+
+
+def _changed_robots(call: Call) -> FleetAnswer:
+    """Return the robots of which something else than place and state changed since a version."""
+    if len(call.query) > 1:
+        raise BadRequestError("since goes with no other parameter")
+    since, manager, queues = call.count("since", 0, MOST_VERSION), call.manager, _queues(call)
+    names = sorted({*manager.facts.robots, *manager.book.robots})
+    changed = manager.robot_changes.since(since, {name: _what_changes(call, name, queues) for name in names})
+    shows = [_show_robot(call, name, queues) for name in changed]
+    return shown(RobotList(robots=shows, version=manager.robot_changes.version))
+
+
+def _what_changes(call: Call, name: str, queues: dict[str, list[str]]) -> Hashable:
+    """Return what a page shows of a robot beside what it has from the planner."""
+    manager = call.manager
+    facts = manager.facts.robots.get(name)
+    entry, task = manager.book.entry(name), manager.book.task_of(name)
+    return (
+        None if facts is None else (facts.by_hand, facts.battery and round(facts.battery, 2)),
+        manager.dispatcher.activity(name),
+        (entry.mode, entry.reason, entry.revision),
+        None if task is None else (task.id, *carried(task)),
+        tuple(queues.get(name, ())),
+    )
 
 
 async def robot(call: Call) -> FleetAnswer:

@@ -20,6 +20,7 @@ from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.hand_goals import HandGoals
 from rce_fleet.manager.planner_link import carry_out
 from rce_fleet.manager.planner_sync import FLEET, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.robot_changes import RobotChanges
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.clamping import clamped
@@ -66,6 +67,7 @@ class FleetManager:
         goals: The goals that were sent.
         hand_goals: The goals that people set.
         changes: Lets requests that change the same thing at the planner follow each other.
+        robot_changes: Which robots changed since a page asked last.
         written: Number of the last event that is in the journal.
     """
 
@@ -107,6 +109,7 @@ class FleetManager:
         self._has_warned_of_lead = False
         self.clock = clock or self._wall
         self._follow_lead()
+        self.robot_changes = RobotChanges(int(1000 * self.clock()))
         self.statistics = FleetStatistics(self.clock(), (Minute(*row) for row in journal.minutes()))
 
     def _load(self) -> None:

@@ -279,6 +279,11 @@ ROUTES: list[Route[str]] = [
         query=(
             Query(name="state", description="States, separated by commas."),
             Query(name="activity", description="Activities, separated by commas."),
+            Query(
+                name="since",
+                description="The version of an answer: only robots that changed after it; 0: all of them.",
+                type="integer",
+            ),
             _CURSOR,
             _LIMIT,
         ),

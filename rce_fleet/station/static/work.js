@@ -27,6 +27,8 @@ export class Work extends EventTarget {
   statistics = null;
   trouble = "none";    // why there is nothing: no manager, or its error; null while the manager answers
   #robotsTasks = new Map(); // id -> task: those of robots that are not among the first ones
+  #robots = new Map();      // id -> robot, as the manager knows it
+  #version = 0;             // of these robots: only those that change after it are asked for
   #timer = null;
 
   constructor(fleet) {
@@ -53,6 +55,8 @@ export class Work extends EventTarget {
     this.trouble = "none";
     this.tasks.clear();
     this.#robotsTasks.clear();
+    this.#robots.clear();
+    this.#version = 0;
     this.openCount = 0;
     this.recent = [];
     this.recurring = [];
@@ -67,7 +71,7 @@ export class Work extends EventTarget {
     try {
       const soon = Math.round(Date.now() / 1000) + WATCHED_S;
       const [robots, open, ended, recurring, due, waiting, zones, statistics] = await Promise.all([
-        ask("GET", "/robots"),
+        ask("GET", `/robots?since=${this.#version}`),
         ask("GET", `/tasks?state=open&limit=${MOST_TASKS}`),
         ask("GET", "/tasks?state=ended&order=desc&limit=20"),
         ask("GET", `/tasks?state=recurring&limit=${MOST_TASKS}`),
@@ -76,8 +80,11 @@ export class Work extends EventTarget {
         ask("GET", "/zones"),
         ask("GET", "/statistics?seconds=3600"),
       ]);
+      for (const robot of robots.robots) this.#robots.set(robot.id, robot);
+      this.#version = robots.version ?? 0;
       const tasks = new Map(open.tasks.map((task) => [task.id, task]));
-      const missing = new Set(robots.robots.map(({ task }) => task).filter((task) => task && !tasks.has(task)));
+      const done = new Set([...this.#robots.values()].map(({ task }) => task));
+      const missing = new Set([...done].filter((task) => task && !tasks.has(task)));
       this.#robotsTasks = await this.#readTasks(missing);
       this.trouble = null;
       this.tasks = tasks;
@@ -85,11 +92,10 @@ export class Work extends EventTarget {
       this.recurring = recurring.tasks.filter(({ state }) => ENDED.includes(state));
       this.recent = ended.tasks.filter(({ recurs_at: next }) => !next);
       this.questions = waiting.tasks.filter(({ question }) => question);
-      const done = new Set(robots.robots.map(({ task }) => task));
       this.atRisk = due.tasks.filter((task) => isAtRisk(task) && !done.has(task.id));
       this.zones = zones.zones;
       this.statistics = statistics;
-      this.#takeRobots(robots.robots);
+      this.#takeRobots();
     } catch (error) {
       this.trouble = error.message;
     }
@@ -112,8 +118,8 @@ export class Work extends EventTarget {
 
   // What the manager knows of robots beside the planner: batteries, tasks, activities, and their own modes, which
   // stay as they are while the whole fleet is paused.
-  #takeRobots(robots) {
-    for (const { id, battery, task, activity, mode, mode_reason: ownReason, queue, loads } of robots) {
+  #takeRobots() {
+    for (const { id, battery, task, activity, mode, mode_reason: ownReason, queue, loads } of this.#robots.values()) {
       const robot = this.fleet.robots.get(id);
       if (!robot) continue;
       const doing = this.find(task);

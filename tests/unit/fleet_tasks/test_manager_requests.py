@@ -98,6 +98,30 @@ async def test_a_viewer_changes_nothing(client: ManagerClient) -> None:
     assert (await client.ask("GET", "/tasks", role="viewer"))[:2] == (200, {"tasks": [], "next": None})
 
 
+async def test_robots_are_listed_by_what_changed(client: ManagerClient) -> None:
+    """A page with 1000 robots asked for all of them every two seconds."""
+    robots = client.manager.facts.robots
+    for number in range(1, 1001):
+        robots[f"Robot{number}"] = RobotFacts(f"Robot{number}", "idle", cell=3, battery=0.8)
+
+    async def changed(since: int) -> tuple[list[str], int]:
+        found = (await client.ask("GET", f"/robots?since={since}"))[1]
+        return [robot["id"] for robot in found["robots"]], found["version"]
+
+    everything, first = await changed(0)
+    assert len(everything) == 1000
+    robots["Robot2"].cell, robots["Robot2"].state, robots["Robot2"].battery = 4, "driving", 0.8001
+    assert await changed(first) == ([], first)
+    assert (await client.ask("POST", "/robots/Robot7/pause"))[0] == 200
+    robots["Robot3"].battery = 0.5
+    found, second = await changed(first)
+    assert (found, second > first) == (["Robot3", "Robot7"], True)
+    assert await changed(second) == ([], second)
+    assert await changed(first) == (["Robot3", "Robot7"], second), "another page, which asked before"
+    assert len((await changed(second + 1))[0]) == 1000, "a version of another manager"
+    assert (await client.ask("GET", "/robots?since=1&limit=5"))[0] == 422
+
+
 @pytest.mark.parametrize("path", ["/robots/Robot1", "/robots/Robot1/take-out", "/robots/Robot1/goal"])
 async def test_no_robot_is_denied_before_the_planner_has_told_its_robots(
     client: ManagerClient, path: str
