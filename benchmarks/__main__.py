@@ -42,11 +42,16 @@ OTHERS = {
         ("simulation",),
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
-    "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("batches",), ("planning",)),
+    "fleet": (
+        *(("light",), ("fleet",), ("traffic",), ("assignment",), ("batches",), ("planning",)),
+        ("station",),
+    ),
+    "day": (("day",),),
     "scale": (("scale",), ("store",)),
 }
-"""Other programs by part; each prints and saves its own figures. :data:`WITHOUT_ENGINE` need no engine."""
-WITHOUT_ENGINE = ("fleet", "scale")
+"""Other programs by part; each prints and saves its own figures. Those of :data:`WITHOUT_ENGINE` need no
+engine, or start their own."""
+WITHOUT_ENGINE = ("fleet", "day", "scale")
 ALWAYS_SHORT = ("mapping",)
 """Programs without an option ``--quick``."""
 

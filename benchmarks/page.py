@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.summary import SUMMARY
-from benchmarks.targets import TARGETS, Target
+from benchmarks.target import Target
+from benchmarks.targets import TARGETS
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "performance.md"
 

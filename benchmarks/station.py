@@ -1,9 +1,10 @@
-"""Measure the operator's page with many robots: ``python -m benchmarks.station [--robots 1000]``.
+"""Measure the operator's page with many robots: ``python -m benchmarks.station [--quick] [--robots 1000]``.
 
-A station serves the page to headless Chromium, which draws without a graphics card. Robots drive on a
+A station serves the page to headless Chromium, with a graphics card if there is one. Robots drive on a
 warehouse of 161 x 63 cells at one cell a second; each second every robot has a new plan and ten new poses.
-The program prints the script's time for a frame beside its target, the frames a second, and what the socket
-carries. The frames a second tell about the renderer of this machine: without a graphics card processors draw
+A fleet manager in the same process has a task for each robot, and batteries that get empty. The program
+prints the script's time for a frame beside its target, the frames a second, and what socket and requests
+carry. The frames a second tell about the renderer of this machine: without a graphics card processors draw
 each pixel, and share their time with the station, the robots and the browser itself.
 """
 
@@ -11,25 +12,42 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import random
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp.test_utils import TestServer
 
+from benchmarks.figures import Results, show
+from rce_fleet.journal.journal import Journal
+from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
+from rce_fleet.manager.manager import FleetManager
+from rce_fleet.manager.requests import FleetRequest, Router
+from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
+from rce_fleet.planning.grid import GridMap
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
+from rce_fleet.tasks.dispatch import TaskRules
+from rce_fleet.tasks.facts import RobotFacts
+from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.task import TaskState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from playwright.async_api import CDPSession
+
+    from rce_fleet.manager.planner_link import PlannerLink
 
 ROWS, COLUMNS = 63, 161
 SHELF = 10
@@ -37,9 +55,12 @@ PLAN = 40
 TICK_S = 0.1
 TICKS = 10
 """Ticks for a cell."""
+DRAIN = 0.0005
+"""Share of a full battery that a robot needs in a second."""
 TARGET_FPS = 60.0
 TARGET_SCRIPT_MS = 16.7
 """A frame at 60 frames a second."""
+SIZES = (3, 100, 1000)
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARGUMENTS = (
     "--no-sandbox",
@@ -47,6 +68,10 @@ ARGUMENTS = (
     "--disable-background-networking",
     "--enable-unsafe-swiftshader",
 )
+GPU_ARGUMENTS = ("--enable-gpu", "--ignore-gpu-blocklist")
+GPU_DEVICES = ("/dev/dri/renderD128", "/dev/nvidia0")
+SOFTWARE = ("swiftshader", "llvmpipe", "software", "basic render")
+"""Words in the names of renderers that draw without a graphics card."""
 
 
 def warehouse() -> frozenset[int]:
@@ -120,6 +145,45 @@ class Traffic:
         return {"pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}}}
 
 
+class ManagedLink(FleetLink):
+    """A link to a fleet manager of this process, and to no planner.
+
+    Args:
+        traffic: The robots, each of which does a task.
+        folder: For the manager's journal.
+    """
+
+    can_ask_manager = expects_manager = True
+
+    def __init__(self, traffic: Traffic, folder: Path) -> None:
+        journal, log = Journal(folder / "journal.sqlite"), logging.getLogger("manager")
+        self.manager = FleetManager(journal, cast("PlannerLink", None), TaskRules(), log)
+        facts, book = self.manager.facts, self.manager.book
+        facts.grid = book.grid = GridMap(ROWS, COLUMNS, blocked=traffic.walls)
+        facts.is_live = True
+        for number, (robot, way) in enumerate(traffic.ways.items()):
+            battery = number / len(traffic.ways)
+            facts.robots[robot] = RobotFacts(robot, "driving", cell=way[0], goal=way[-1], battery=battery)
+            task = book.create(Order((Stop(Action.GO, (way[-1],)),)), self.manager.clock())
+            book.put_record(replace(task, state=TaskState.RUNNING, robot=robot))
+        self._router = Router(self.manager, [*TASK_ROUTES, *FLEET_ROUTES])
+
+    def forget_requests(self) -> None:
+        """Keep none: no planner is connected."""
+
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Have the manager answer a request."""
+        answer = await self._router.answer(FleetRequest(**request))
+        return {"status": answer.status, "body": answer.body, "revision": answer.revision}
+
+    def advance(self, traffic: Traffic, robots: list[str], seconds: float) -> None:
+        """Tell the manager where robots are, and that their batteries got emptier."""
+        for name in robots:
+            robot = self.manager.facts.robots[name]
+            robot.cell, robot.goal = traffic.ways[name][0], traffic.ways[name][-1]
+            robot.battery = ((robot.battery or 0.0) - DRAIN * seconds) % 1.0
+
+
 @asynccontextmanager
 async def served(robots: int) -> AsyncIterator[tuple[str, Callable[[], Coroutine[Any, Any, None]]]]:
     """Serve a page; give its address, and what drives the robots until cancelled."""
@@ -148,6 +212,7 @@ async def served(robots: int) -> AsyncIterator[tuple[str, Callable[[], Coroutine
             group = names[tick % TICKS :: TICKS]
             for robot in group:
                 traffic.advance(robot)
+            link.advance(traffic, group, TICKS * TICK_S)
             changes = {"robots": [traffic.state(robot) for robot in group], "removed": []}
             feed.on_change(view.on_changes({**changes, "blocked": [], "pending": [], "freed": []}))
             for place, robot in enumerate(names):
@@ -157,14 +222,23 @@ async def served(robots: int) -> AsyncIterator[tuple[str, Callable[[], Coroutine
             tick += 1
             await asyncio.sleep(max(0.01, TICK_S - (time.monotonic() - started)))
 
-    station = Station(view, FleetLink.__new__(FleetLink), feed.pages)
-    async with TestServer(station.make_app()) as server:
-        yield str(server.make_url("/")), drive
+    with tempfile.TemporaryDirectory() as folder:
+        link = ManagedLink(traffic, Path(folder))
+        station = Station(view, link, feed.pages)
+        await station.fleet_api.manager.look()
+        try:
+            async with TestServer(station.make_app()) as server:
+                yield str(server.make_url("/")), drive
+        finally:
+            await link.manager.close()
 
 
 MEASURE = """seconds => new Promise(resolve => {
     const { meter } = rceFleet.view;
     Object.assign(meter, { frames: 0, drawn: 0, script_ms: 0, longest_ms: 0 });
+    performance.clearResourceTimings();
+    const isRequest = ({ name }) => name.includes("/api/v1/");
+    const requests = () => performance.getEntriesByType("resource").filter(isRequest);
     const start = performance.now();
     setTimeout(() => {
         const spent = (performance.now() - start) / 1000;
@@ -175,6 +249,7 @@ MEASURE = """seconds => new Promise(resolve => {
             longest_ms: meter.longest_ms,
             messages_ms: rceFleet.traffic.spent_ms / Math.max(1, rceFleet.traffic.messages),
             kilobytes_s: rceFleet.traffic.bytes / spent / 1000,
+            requests_kilobytes_s: requests().reduce((sum, one) => sum + one.decodedBodySize, 0) / spent / 1e3,
         });
     }, 1000 * seconds);
     Object.assign(rceFleet.traffic, { spent_ms: 0, messages: 0, bytes: 0 });
@@ -198,32 +273,65 @@ DRAW = """() => {
 machine did not interrupt."""
 
 
+RENDERER = """() => {
+    const gl = document.createElement("canvas").getContext("webgl2");
+    const info = gl?.getExtension("WEBGL_debug_renderer_info");
+    return gl ? gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER) : "";
+}"""
+"""What draws: the name of a graphics card, or of a program; empty without WebGL."""
+
+
+def browser_arguments() -> list[str]:
+    """Return Chromium's arguments, with a graphics card if the machine has one."""
+    has_gpu = any(Path(device).exists() for device in GPU_DEVICES)
+    return [*ARGUMENTS, *(GPU_ARGUMENTS if has_gpu else ())]
+
+
+def is_graphics_card(renderer: str) -> bool:
+    """Return whether the name of a renderer is that of a graphics card."""
+    return bool(renderer) and not any(word in renderer.lower() for word in SOFTWARE)
+
+
 async def measure(robots: int, seconds: float, picture: str, renderer: str = "") -> dict[str, Any]:
     """Return the page's figures with some robots."""
     from playwright.async_api import async_playwright
 
     async with served(robots) as (url, drive), async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=browser_arguments())
         driving = asyncio.create_task(drive())
         try:
             page = await browser.new_page(viewport={"width": 1600, "height": 1000})
             page.set_default_timeout(60_000)
             await page.goto(f"{url}?renderer={renderer}")
             await page.wait_for_function(f"rceFleet.view.scene.robotCount === {robots}")
+            await page.wait_for_function("rceFleet.work.trouble === null")
             await asyncio.sleep(2.0)
             session = await page.context.new_cdp_session(page)
             await session.send("Performance.enable", {"timeDomain": "threadTicks"})
             before = await thread_seconds(session)
-            figures: dict[str, Any] = await page.evaluate(MEASURE, seconds)
+            found: dict[str, Any] = await page.evaluate(MEASURE, seconds)
             spent = await thread_seconds(session) - before
-            figures["frame_ms"] = await page.evaluate(DRAW)
-            figures["thread_ms"] = 1000 * spent / max(1.0, figures["fps"] * seconds)
+            script_ms = await page.evaluate(DRAW)
+            drawn_by = await page.evaluate(RENDERER) if found["renderer"] != "canvas" else ""
             if picture:
                 await page.screenshot(path=picture)
-            return figures
         finally:
             driving.cancel()
             await browser.close()
+    row: dict[str, Any] = {
+        "robots": robots,
+        "script ms per frame": round(script_ms, 2),
+        "target, script ms": TARGET_SCRIPT_MS,
+        "main thread ms per frame": round(1000 * spent / max(1.0, found["fps"] * seconds), 2),
+        "ms per message": round(found["messages_ms"], 2),
+        "socket kB/s": round(found["kilobytes_s"]),
+        "requests kB/s": round(found["requests_kilobytes_s"]),
+        "renderer": found["renderer"],
+        "frames/s": round(found["fps"], 1),
+    }
+    if is_graphics_card(drawn_by):
+        row |= {"frames/s, graphics card": row["frames/s"], "target, frames/s": TARGET_FPS}
+    return row
 
 
 async def thread_seconds(session: CDPSession) -> float:
@@ -233,24 +341,26 @@ async def thread_seconds(session: CDPSession) -> float:
 
 
 def main() -> None:
-    """Print the figures beside their target."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", type=int, nargs="*", default=[3, 100, 1000])
-    parser.add_argument("--seconds", type=float, default=5.0)
+    """Print the figures beside their targets, and save them."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.station", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="3 and 100 robots, a shorter time")
+    parser.add_argument("--robots", type=int, nargs="*", default=[])
+    parser.add_argument("--seconds", type=float, default=0.0)
     parser.add_argument("--renderer", default="", help="canvas: without WebGL")
     parser.add_argument("--pictures", default="", help="folder for a picture of each page")
     options = parser.parse_args()
     if CHROMIUM is None:
         sys.exit("this benchmark needs chromium")
-    for robots in options.robots:
+    is_partial = bool(options.robots or options.seconds or options.renderer)
+    seconds = options.seconds or (2.0 if options.quick else 5.0)
+    results = Results("station", quick=options.quick or is_partial)
+    rows = []
+    for robots in options.robots or (SIZES[:-1] if options.quick else SIZES):
         picture = f"{options.pictures}/station-{robots}.png" if options.pictures else ""
-        figures = asyncio.run(measure(robots, options.seconds, picture, options.renderer))
-        print(
-            f"{robots:5} robots: script {figures['frame_ms']:.2f} ms a frame (target {TARGET_SCRIPT_MS:g}),"
-            f" {figures['messages_ms']:.2f} ms a message, {figures['kilobytes_s']:.0f} kB/s;"
-            f" {figures['renderer']}: {figures['fps']:.1f} frames/s (target {TARGET_FPS:g} with a graphics"
-            f" card), main thread {figures['thread_ms']:.2f} ms of processor a frame"
-        )
+        rows.append(asyncio.run(measure(robots, seconds, picture, options.renderer)))
+    show("The operator's page", rows)
+    results.keep("page", rows)
+    print("results:", results.save())
 
 
 if __name__ == "__main__":

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from benchmarks import attacks, failover
 from benchmarks.ros import tools
-
-Rows = Sequence[Mapping[str, Any]]
+from benchmarks.target import Rows, Target, read_greatest, read_last, read_least
 
 RATIOS = {
     "converter": {20: 2.9, 784: 2.7, 6951: 3.0, 61584: 3.0, 545559: 3.0, 4832930: 3.5, 10000000: 3.0},
@@ -19,71 +17,13 @@ RATIOS = {
 RATIOS["forwarder, one frame"] = RATIOS["forwarder"]
 
 
-@dataclass(frozen=True)
-class Target:
-    """A target figure."""
-
-    what: str
-    suite: str
-    read: Callable[[Rows], float | None]
-    """Finds the figure; None if the rows do not contain it."""
-    limit: float
-    unit: str
-    at_least: bool = False
-    lower: float | None = None
-    """A second limit, which the figure is not below."""
-
-    @property
-    def wanted(self) -> str:
-        """The limits in words."""
-        if self.lower is not None:
-            return f"{self.lower:g} to {self.limit:g} {self.unit}".rstrip()
-        return f"{'≥' if self.at_least else '≤'} {self.limit:g} {self.unit}".rstrip()
-
-    def is_met(self, figure: float) -> bool:
-        """Return whether a figure reaches the target."""
-        if self.lower is not None and figure < self.lower:
-            return False
-        return figure >= self.limit if self.at_least else figure <= self.limit
-
-
-def _column(column: str, **where: object) -> Callable[[Rows], float | None]:
-    """Read a column of the last row in which other columns have these values."""
-
-    def read(rows: Rows) -> float | None:
-        found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
-        return _number(found[-1].get(column)) if found else None
-
-    return read
-
-
-def _greatest(column: str, **where: object) -> Callable[[Rows], float | None]:
-    """Read the greatest value of a column in the rows in which other columns have these values."""
-    return lambda rows: max(_values(rows, column, where), default=None)
-
-
-def _least(column: str, **where: object) -> Callable[[Rows], float | None]:
-    """Read the least value of a column in the rows in which other columns have these values."""
-    return lambda rows: min(_values(rows, column, where), default=None)
-
-
-def _values(rows: Rows, column: str, where: Mapping[str, object]) -> list[float]:
-    found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
-    return [number for row in found if (number := _number(row.get(column))) is not None]
-
-
-def _number(value: object) -> float | None:
-    """Read a figure; texts such as ``7.6 s`` by their number."""
-    return None if value is None else float(str(value).split()[0])
-
-
 _WAREHOUSE, _RANDOM = "warehouse-10-20-10-2-1", "random-32-32-20"
 _PLANS = [
     *(
         Target(
             f"first plan for {robots} robots on {name}, least of 9 seeds",
             "planning.first",
-            _column("ms", map=name, robots=robots),
+            read_last("ms", map=name, robots=robots),
             limit,
             "ms",
         )
@@ -92,7 +32,7 @@ _PLANS = [
     Target(
         f"first plan for 1000 robots on {_WAREHOUSE}, cost over lower bound, worst of 9 seeds",
         "planning.first",
-        _column("cost / bound, worst", map=_WAREHOUSE, robots=1000),
+        read_last("cost / bound, worst", map=_WAREHOUSE, robots=1000),
         3.3,
         "x bound",
     ),
@@ -100,7 +40,7 @@ _PLANS = [
         Target(
             f"plan for {robots} robots on {name} after 10 s, cost over lower bound",
             "planning.anytime",
-            _column("cost / bound", map=name, robots=robots, seconds=10.0),
+            read_last("cost / bound", map=name, robots=robots, seconds=10.0),
             limit,
             "x bound",
         )
@@ -110,7 +50,7 @@ _PLANS = [
         Target(
             f"lifelong, {robots} robots on aisles-33-46, tasks by robots over distance, worst seed",
             "planning.lifelong",
-            _least("share of robots / distance", robots=robots),
+            read_least("share of robots / distance", robots=robots),
             limit,
             "share",
             at_least=True,
@@ -121,7 +61,7 @@ _PLANS = [
         Target(
             f"lifelong, {robots} robots on aisles-33-46, longest step",
             "planning.lifelong",
-            _greatest("longest step ms", robots=robots),
+            read_greatest("longest step ms", robots=robots),
             100,
             "ms",
         )
@@ -131,7 +71,7 @@ _PLANS = [
         Target(
             f"first plan for 10 000 robots on 3 x 3 {_WAREHOUSE}, {what}",
             "planning.large",
-            _column(column, robots=10_000),
+            read_last(column, robots=10_000),
             limit,
             unit,
         )
@@ -142,7 +82,7 @@ _ROUND_TRIPS = [
     Target(
         f"{path}, {size} bytes, p50",
         "roundtrip",
-        _column("x bare", path=path, bytes=size),
+        read_last("x bare", path=path, bytes=size),
         limit,
         "x bare echo",
     )
@@ -157,7 +97,7 @@ _IN_TLS = [
     Target(
         f"TLS on the robot's connection, {form}, {size} bytes, p50",
         "tls",
-        _column("x plain (p50)", form=form, bytes=size),
+        read_last("x plain (p50)", form=form, bytes=size),
         limit,
         "x plain",
     )
@@ -169,7 +109,7 @@ _LOCALIZATION = [
     Target(
         f"amcl in the demo's world, {sensor}: {what}",
         f"localization.{suite}",
-        _column(column, sensor=sensor),
+        read_last(column, sensor=sensor),
         limit or near,
         unit,
         lower=lower,
@@ -187,7 +127,7 @@ _MAPPING = [
     Target(
         f"mapping of {log} with {algorithm}: {what}",
         "mapping.mapping",
-        _column(column, log=log, **{"with": algorithm}),
+        read_last(column, log=log, **{"with": algorithm}),
         limit,
         unit,
         at_least=at_least,
@@ -218,7 +158,7 @@ _EXPLORATION = [
     Target(
         f"exploration of the demo's floor with {algorithm}: {what}",
         "exploration.exploration",
-        _column(column, **{"with": algorithm}),
+        read_last(column, **{"with": algorithm}),
         limit,
         unit,
         at_least=at_least,
@@ -232,6 +172,9 @@ _EXPLORATION = [
     )
 ]
 
+DAY_TASKS_PER_HOUR = 1800.0
+"""Least that the fleet of the ``day`` does: nine tenths of what it did when this was measured first."""
+
 ABUSE_P99_MS = 20.0
 """Most that another user's abuse may make of the round trips of a robot's 100 Hz probe."""
 ABUSE_MORE_MS = 100.0
@@ -240,7 +183,7 @@ _ABUSE = [
     Target(
         f"a robot's 100 Hz probe beside another user's abuse, {kind}, {what}",
         "abuse",
-        _column(column, abuse=kind),
+        read_last(column, abuse=kind),
         limit,
         "ms",
     )
@@ -252,16 +195,20 @@ _ABUSE = [
 ]
 
 _STORE = [
-    Target("etcd, three members: a save of one row, p50", "store.save", _column("p50_ms", rows=1), 3, "ms"),
-    Target("etcd, three members: a save of 64 rows, p99", "store.save", _column("p99_ms", rows=64), 30, "ms"),
-    Target("etcd beside idle masters, each member", "store.idle", _column("cores_percent"), 2, "% of a core"),
-    Target("etcd beside idle masters, each member, PSS", "store.idle", _column("PSS MB"), 100, "MB"),
+    Target("etcd, three members: a save of one row, p50", "store.save", read_last("p50_ms", rows=1), 3, "ms"),
+    Target(
+        "etcd, three members: a save of 64 rows, p99", "store.save", read_last("p99_ms", rows=64), 30, "ms"
+    ),
+    Target(
+        "etcd beside idle masters, each member", "store.idle", read_last("cores_percent"), 2, "% of a core"
+    ),
+    Target("etcd beside idle masters, each member, PSS", "store.idle", read_last("PSS MB"), 100, "MB"),
 ]
 _SCALE = [
     Target(
         f"1000 machines, 100 000 containers in the master's state: {what}",
         f"scale.{suite}",
-        _column(column, machines=1000),
+        read_last(column, machines=1000),
         limit,
         unit,
     )
@@ -280,11 +227,28 @@ _SCALE.append(
     Target(
         "the longest that a command of 2000 robots or of a full queue holds the master's loop, CPU",
         "scale.holds",
-        _greatest("longest, ms"),
+        read_greatest("longest, ms"),
         20,
         "ms",
     )
 )
+
+_DAY = [
+    Target(
+        f"100 robots do tasks for 600 s, planner killed twice: {what}",
+        "day.run",
+        read_last(column, robots=100),
+        limit,
+        unit,
+        at_least=at_least,
+    )
+    for what, column, limit, unit, at_least in (
+        ("the run is ok (1)", "ok", 1, "", True),
+        ("tasks lost", "tasks lost", 0, "tasks", False),
+        ("longest standstill", "longest standstill s", 60, "s", False),
+        ("tasks done", "tasks/h", DAY_TASKS_PER_HOUR, "/h", True),
+    )
+]
 
 TARGETS = [
     *_ROUND_TRIPS,
@@ -293,7 +257,7 @@ TARGETS = [
     Target(
         "messages of 64 B, 32 in flight, converter",
         "rate",
-        _column("messages/s", path="converter"),
+        read_last("messages/s", path="converter"),
         6000,
         "/s",
         at_least=True,
@@ -301,50 +265,52 @@ TARGETS = [
     Target(
         "memory with a robot and an echo container, sum of PSS",
         "memory",
-        _column("PSS MB", process="sum"),
+        read_last("PSS MB", process="sum"),
         100,
         "MB",
     ),
-    Target("fan-out to 200 at 20 Hz, p95", "fanout", _column("p95_ms", clients=200), 20, "ms"),
+    Target("fan-out to 200 at 20 Hz, p95", "fanout", read_last("p95_ms", clients=200), 20, "ms"),
     Target(
         "1000 robots join one container: control bytes of the last hundred, 1.0 is linear",
         "joining",
-        _column("x first hundred (bytes)", robots=1000),
+        read_last("x first hundred (bytes)", robots=1000),
         1.1,
         "x first hundred",
     ),
     Target(
         "1000 robots join one container: CPU of the last hundred, 1.0 is linear",
         "joining",
-        _column("x first hundred (CPU)", robots=1000),
+        read_last("x first hundred (CPU)", robots=1000),
         1.3,
         "x first hundred",
     ),
     Target(
         "a robot task set ends: its 200 robots are at another one, with all that they had",
         "failover",
-        _greatest("seconds until all are elsewhere", robots=200, target=failover.TARGET_S),
+        read_greatest("seconds until all are elsewhere", robots=200, target=failover.TARGET_S),
         2,
         "s",
     ),
     Target(
         "a robot task set is drained: the same",
         "failover",
-        _greatest("seconds until all are elsewhere", **{"robot task set": failover.DRAINED, "robots": 200}),
+        read_greatest(
+            "seconds until all are elsewhere", **{"robot task set": failover.DRAINED, "robots": 200}
+        ),
         2,
         "s",
     ),
     Target(
         "a robot task set hangs: the same",
         "failover",
-        _greatest("seconds until all are elsewhere", **{"robot task set": failover.HUNG, "robots": 200}),
+        read_greatest("seconds until all are elsewhere", **{"robot task set": failover.HUNG, "robots": 200}),
         20,
         "s",
     ),
     Target(
         "one client stalls: what the others get",
         "stalled",
-        _column("share %", phase="it still stalls"),
+        read_last("share %", phase="it still stalls"),
         95,
         "%",
         at_least=True,
@@ -353,38 +319,54 @@ TARGETS = [
         Target(
             f"a pose of a driving robot at the planner, {robots} robots",
             "fleet.planner",
-            _column("driving, us per pose", robots=robots),
+            read_last("driving, us per pose", robots=robots),
             50,
             "us",
         )
         for robots in (50, 2000)
     ),
+    Target(
+        "operator's page and fleet manager, script ms per frame with 1000 robots",
+        "station.page",
+        read_last("script ms per frame", robots=1000),
+        16.7,
+        "ms",
+    ),
+    Target(
+        "operator's page with a graphics card, frames/s with 1000 robots",
+        "station.page",
+        read_last("frames/s, graphics card", robots=1000),
+        60,
+        "/s",
+        at_least=True,
+    ),
+    *_DAY,
     *_PLANS,
     Target(
         "the planner's tick with 1000 robots, all in, CPU, p99",
         "traffic.tick",
-        _column("p99 ms", robots=1000),
+        read_last("p99 ms", robots=1000),
         100,
         "ms",
     ),
     Target(
         "a cell is blocked: work until the last of 1000 robots has its new path, CPU, worst of 20",
         "traffic.block",
-        _greatest("ms", robots=1000),
+        read_greatest("ms", robots=1000),
         100,
         "ms",
     ),
     Target(
         "1000 tasks are given to 1000 idle robots, CPU, least of 7",
         "assignment.choose",
-        _column("ms", robots=1000),
+        read_last("ms", robots=1000),
         60,
         "ms",
     ),
     Target(
         "1000 tasks on a new grid: longest stop of the fleet manager for distances, CPU",
         "assignment.choose",
-        _column("new grid, longest slice ms", robots=1000),
+        read_last("new grid, longest slice ms", robots=1000),
         50,
         "ms",
     ),
@@ -392,7 +374,7 @@ TARGETS = [
         Target(
             f"simulated world, 100 robots with {sensor}s, one core, best of 5 passes",
             "simulation.world",
-            _column("x real time", robots=100, sensor=sensor),
+            read_last("x real time", robots=100, sensor=sensor),
             1,
             "x real time",
             at_least=True,
@@ -403,7 +385,7 @@ TARGETS = [
         Target(
             f"1000 light robots without the engine, {what}, one core",
             suite,
-            _column("x real time", robots=1000),
+            read_last("x real time", robots=1000),
             2.24,
             "x real time",
             at_least=True,
@@ -416,7 +398,7 @@ TARGETS = [
     Target(
         "simulated world with ROS nodes, 100 robots with lidars, one core, best of 5 passes",
         "simulation.nodes",
-        _column("x real time", robots=100),
+        read_last("x real time", robots=100),
         1,
         "x real time",
         at_least=True,
@@ -425,7 +407,7 @@ TARGETS = [
         Target(
             f"navigation, {what}",
             "navigation.drive",
-            _column(column, sampling="pursuit"),
+            read_last(column, sampling="pursuit"),
             limit,
             unit,
             at_least=at_least,
@@ -441,7 +423,7 @@ TARGETS = [
         Target(
             f"amcl: an update, 500 particles x 60 beams, {form}, median",
             "localization.update",
-            _column("likelihood_field p50 ms", form=form),
+            read_last("likelihood_field p50 ms", form=form),
             limit,
             "ms",
         )
@@ -453,7 +435,7 @@ TARGETS = [
     Target(
         "amcl, global localization right within 30 s",
         "localization.global",
-        _column("right in time %", robot="anywhere"),
+        read_last("right in time %", robot="anywhere"),
         95,
         "%",
         at_least=True,
@@ -461,17 +443,17 @@ TARGETS = [
     Target(
         "amcl, a kidnapped robot right again within 60 s",
         "localization.kidnapped",
-        _column("right in time %", robot="kidnapped"),
+        read_last("right in time %", robot="kidnapped"),
         90,
         "%",
         at_least=True,
     ),
     *_SCALE,
     *_STORE,
-    Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
-    Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
-    Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),
-    Target("slowest ROS tool at our core", "ros.tools", _greatest("ratio"), tools.TARGET, "x rosmaster"),
+    Target("container start to first message, p50", "start", read_last("p50_ms"), 250, "ms"),
+    Target("100 containers at once", "many", read_last("all at once", containers=100), 20, "s"),
+    Target("idle container, PSS", "many", read_last("idle container PSS MB"), 15, "MB"),
+    Target("slowest ROS tool at our core", "ros.tools", read_greatest("ratio"), tools.TARGET, "x rosmaster"),
 ]
 
 
