@@ -168,9 +168,33 @@ class ZoneList(ApiModel):
 
 
 class CellChange(ApiModel):
-    """Whether a cell is blocked."""
+    """Whether a cell is blocked, why, and until when."""
+
+    _numbers = field_validator("until", mode="before")(numbers_only)
 
     blocked: bool
+    reason: str = Field(default="", description="Why it is blocked, for people.", max_length=MOST_REASON)
+    until: Moment | None = Field(
+        default=None,
+        description="When a blocked cell is freed, seconds since 1970; null: it stays blocked.",
+    )
+
+
+class CellBlockModel(ApiModel):
+    """Who blocked a cell, and why."""
+
+    cell: int
+    user: str = Field(default="", description="Who blocked it; empty: a robot's sensor, or not told.")
+    robot: str = Field(
+        default="", description="The robot whose sensor found it blocked; empty: people blocked it."
+    )
+    reason: str = ""
+    since: float | None = Field(
+        default=None, description="When it was blocked, seconds since 1970; null: not told."
+    )
+    until: float | None = Field(
+        default=None, description="When it is freed, seconds since 1970; null: it stays blocked."
+    )
 
 
 class FleetModeChange(ApiModel):
@@ -221,6 +245,10 @@ class FleetMapModel(ApiModel):
     yaw: float = Field(description="Direction of the columns, radians counter-clockwise from x.")
     walls: list[int]
     blocked: list[int] = Field(description="Blocked cells, walls left out, and cells that will be blocked.")
+    blocks: list[CellBlockModel] = Field(
+        default_factory=list,
+        description="Who blocked them, and why, by cell; not of cells that only zones block.",
+    )
     lanes: list[LaneModel] = Field(
         default_factory=list,
         description="Lanes that robots keep to, their other cells are walls; empty: all cells can be driven.",

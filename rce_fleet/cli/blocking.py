@@ -1,7 +1,8 @@
 """``rce fleet block`` and ``free``: cells, moves and lanes, for all robots or for some, for a time.
 
 A cell that is blocked for all robots until it is freed has no zone. Everything else is a zone that is named
-after its place, so that ``free`` finds it: ``block 12``, ``block 12>13 for Robot1``.
+after its place, so that ``free`` finds it: ``block 12``, ``block 12>13 for Robot1``. Zones need a fleet
+manager; without one, a cell for all robots gets reason and end itself.
 """
 
 from __future__ import annotations
@@ -85,7 +86,12 @@ def block(
                         "until": end,
                     }
                 )
-            await client.set_zone(place.zone(robots), asked)
+            try:
+                await client.set_zone(place.zone(robots), asked)
+            except FleetApiUnavailableError:
+                if robots or not place.cells:
+                    raise
+                await client.set_blocked(place.cells[0], blocked=True, reason=reason, until=end)
             whom = f" for {', '.join(robots)}" if robots else ""
             when = f" until {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(end))}" if end else ""
             typer.echo(f"{_word(place)} is blocked{whom}{when}")

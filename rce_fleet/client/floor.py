@@ -27,15 +27,30 @@ class FloorRequests(ApiRequests):
         """
         return await self._read("/fleet", FleetModel)
 
-    async def set_blocked(self, cell: int, *, blocked: bool) -> str:
+    async def set_blocked(
+        self, cell: int, *, blocked: bool, reason: str = "", until: float | None = None
+    ) -> str:
         """Block or free a cell; return the answer for people.
+
+        Args:
+            cell: The cell.
+            blocked: Whether to block it.
+            reason: Why it is blocked, for people.
+            until: When a blocked cell is freed, seconds since 1970; None: it stays blocked.
 
         Example:
             ```python
-            print(await fleet.set_blocked(17, blocked=True))
+            print(await fleet.set_blocked(17, blocked=True, reason="spill", until=1796000000.0))
+            print([(block.cell, block.user, block.robot) for block in (await fleet.map()).blocks])
             ```
         """
-        return (await self._send("PUT", f"/cells/{cell}", Answer, CellRequest(blocked=blocked))).message
+        given: dict[str, object] = {"blocked": blocked}
+        if reason:
+            given["reason"] = reason
+        if until is not None:
+            given["until"] = until
+        request = CellRequest.model_validate(given)
+        return (await self._send("PUT", f"/cells/{cell}", Answer, request)).message
 
     async def map(self) -> FleetMapModel:
         """Return the grid.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
-from math import hypot
+from math import hypot, inf
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.cell_blocks import CellBlock, ended, renewed
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -39,7 +41,7 @@ class CellBlocking:
     """Blocks and frees cells, and stops the robots concerned.
 
     A cell that only sensors found blocked is freed when a sensor sees that nothing is there any more; one
-    that a person blocked is freed by a person only.
+    that a person blocked is freed by a person only, or when its time has come.
 
     Args:
         state: The fleet's state.
@@ -51,6 +53,8 @@ class CellBlocking:
         self._dispatcher = dispatcher
         self._witnesses: dict[int, tuple[str, float]] = {}
         """Which robot reported a cell as blocked last, and when."""
+        self._next_end = 0.0
+        """No block of a single cell ends earlier."""
 
     # What robots see
 
@@ -65,7 +69,8 @@ class CellBlocking:
                 continue
             if not state.is_shut(cell):
                 self._shut(cell)
-                state.sensed.add(cell)
+                state.put_block(cell, CellBlock(event.robot, self._dispatcher.now, sensed=True))
+                self._next_end = 0.0
             self._witnesses[cell] = event.robot, self._dispatcher.now
 
     def free_latest_of(self, robot: str) -> None:
@@ -108,7 +113,7 @@ class CellBlocking:
     def take_robot(self, cell: int) -> None:
         """Free a cell that sensors found blocked and that a robot is in: they saw that robot."""
         if cell in self._state.sensed:
-            self._state.sensed.discard(cell)
+            self._state.drop_block(cell)
             self._release([cell])
 
     # Requests
@@ -120,8 +125,11 @@ class CellBlocking:
         if refusal:
             return Reply(False, refusal)
         self._shut(cell)
-        self._state.sensed.discard(cell)  # Sensors do not free what a person blocked.
-        self._state.requested.add(cell)
+        now = self._dispatcher.now
+        since = now if event.since is None else min(event.since, now)
+        made = CellBlock(event.by, since, event.reason, event.expires)
+        self._state.put_block(cell, renewed(self._state.requested.get(cell), made))
+        self._next_end = min(self._next_end, event.expires)
         owner = self._state.ledger.owner(cell)
         if owner is None:
             return Reply(True, f"cell {cell} is blocked")
@@ -138,8 +146,7 @@ class CellBlocking:
             return Reply(False, f"cell {cell} is blocked by {describe_zone(zone)}: remove the zone")
         if not self._state.has_reason(cell):
             return Reply(True, f"cell {cell} is not blocked")
-        self._state.sensed.discard(cell)
-        self._state.requested.discard(cell)
+        self._state.drop_block(cell)
         self._release([cell])
         return Reply(True, f"cell {cell} is free")
 
@@ -164,10 +171,35 @@ class CellBlocking:
         return Reply(True, f"{made} zones changed; their revision is {book.revision}")
 
     def end_expired(self, now: float) -> None:
-        """Remove the zones that have ended."""
+        """Remove the zones and the blocks of cells that have ended."""
         expired = self._state.zones.expired(now)
         if expired:
             self._change_zones((), expired)
+        if now >= self._next_end:
+            self._end_blocks(now)
+
+    def _end_blocks(self, now: float) -> None:
+        """End the blocks of cells whose time has come, and note when the next one ends."""
+        state = self._state
+        cells = [*ended(state.requested, now), *ended(self._sensed_blocks(), now)]
+        for cell in cells:
+            state.drop_block(cell)
+        self._release(cells)
+        if not state.blocked.isdisjoint(cells):
+            # A zone keeps some of them blocked; the list of requested cells changes all the same.
+            self._dispatcher.out.append(BlockedChanged(tuple(sorted(state.blocked))))
+        left = [*state.requested.values(), *self._sensed_blocks().values()]
+        self._next_end = min((block.expires for block in left), default=inf)
+
+    def _sensed_blocks(self) -> dict[int, CellBlock]:
+        """Return the blocks of sensed cells with their ends, counted from the newest report of a robot."""
+        lifetime = self._dispatcher.settings.sensed_lifetime
+        if not lifetime:
+            return {}
+        return {
+            cell: replace(block, expires=self._witnesses.get(cell, ("", block.since))[1] + lifetime)
+            for cell, block in self._state.sensed.items()
+        }
 
     # Zones
 

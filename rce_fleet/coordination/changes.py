@@ -10,8 +10,9 @@ from math import nan
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
+    from rce_fleet.coordination.cell_blocks import CellBlock
     from rce_fleet.coordination.snapshot import RobotSnapshot
     from rce_fleet.coordination.zones import Zone
 
@@ -29,6 +30,8 @@ class FleetChanges:
         freed: Cells that are not blocked or pending any more, ascending.
         zones: Zones that are new or changed, by id.
         removed_zones: Ids of removed zones, ascending.
+        blocks: Cells that were blocked by a person or a sensor, or of which who or why changed, ascending.
+        removed_blocks: Cells that neither blocks any more, ascending; zones may.
     """
 
     sequence: int
@@ -39,6 +42,8 @@ class FleetChanges:
     freed: tuple[int, ...] = ()
     zones: tuple[Zone, ...] = ()
     removed_zones: tuple[str, ...] = ()
+    blocks: tuple[tuple[int, CellBlock], ...] = ()
+    removed_blocks: tuple[int, ...] = ()
 
 
 class ChangeLog:
@@ -55,13 +60,14 @@ class ChangeLog:
         self._told: dict[str, RobotSnapshot] = {}
         self._told_cells: dict[int, bool] = {}
         self._told_zones: dict[str, Zone] = {}
+        self._told_blocks: dict[int, CellBlock] = {}
 
     def note_robot(self, robot: str) -> None:
         """Note that a robot may have changed, come or gone."""
         self._robots.add(robot)
 
     def note_cell(self, cell: int) -> None:
-        """Note that a cell may have been blocked or freed."""
+        """Note that a cell may have been blocked or freed, or that who blocked it changed."""
         self._cells.add(cell)
 
     def take(
@@ -69,6 +75,7 @@ class ChangeLog:
         describe: Callable[[str], RobotSnapshot | None],
         is_blocked: Callable[[int], bool | None],
         zones: Mapping[str, Zone] | None = None,
+        block_of: Callable[[int], CellBlock | None] = lambda _cell: None,
     ) -> FleetChanges | None:
         """Return what changed since the last call; None if nothing did.
 
@@ -76,6 +83,7 @@ class ChangeLog:
             describe: Returns the state of a robot; None if it was removed.
             is_blocked: Returns whether a cell is blocked (True), pending (False) or neither (None).
             zones: All zones, by id.
+            block_of: Returns who blocked a cell, and why; None: neither a person nor a sensor.
         """
         noted, self._robots = sorted(self._robots), set()
         cells, self._cells = sorted(self._cells), set()
@@ -92,13 +100,15 @@ class ChangeLog:
                     del self._told_cells[cell]
                 else:
                     self._told_cells[cell] = now
+        blocks, removed_blocks = self._tell_blocks(cells, block_of)
         all_zones = {} if zones is None else zones
         new_zones = tuple(
             all_zones[name] for name in sorted(all_zones) if self._told_zones.get(name) != all_zones[name]
         )
         removed_zones = tuple(sorted(self._told_zones.keys() - all_zones.keys()))
         self._told_zones = dict(all_zones)
-        if not (robots or removed or any(parts.values()) or new_zones or removed_zones):
+        has_news = robots or removed or any(parts.values()) or blocks or removed_blocks
+        if not (has_news or new_zones or removed_zones):
             return None
         self.sequence += 1
         return FleetChanges(
@@ -110,7 +120,24 @@ class ChangeLog:
             freed=tuple(parts[None]),
             zones=new_zones,
             removed_zones=removed_zones,
+            blocks=blocks,
+            removed_blocks=removed_blocks,
         )
+
+    def _tell_blocks(
+        self, cells: Iterable[int], block_of: Callable[[int], CellBlock | None]
+    ) -> tuple[tuple[tuple[int, CellBlock], ...], tuple[int, ...]]:
+        """Return the blocks that differ from the last published ones, and the cells that have none now."""
+        made: list[tuple[int, CellBlock]] = []
+        gone: list[int] = []
+        for cell in cells:
+            now = block_of(cell)
+            if now is None and self._told_blocks.pop(cell, None) is not None:
+                gone.append(cell)
+            elif now is not None and now != self._told_blocks.get(cell):
+                self._told_blocks[cell] = now
+                made.append((cell, now))
+        return tuple(made), tuple(gone)
 
     def _tell(self, robot: str, now: RobotSnapshot | None) -> RobotSnapshot | None:
         """Return a robot's state if it differs from the last published one."""

@@ -97,9 +97,21 @@ class GoalSet:
 
 @dataclass(frozen=True, slots=True)
 class CellBlocked:
-    """A cell is blocked. Answered by :class:`Reply`."""
+    """A cell is blocked. Answered by :class:`Reply`.
+
+    Attributes:
+        cell: The cell.
+        by: Who blocks it; empty: not told.
+        reason: Why, for people.
+        since: When it was blocked, seconds of the planner's clock; None: now.
+        expires: When it is freed, seconds of the planner's clock; infinity: it stays blocked.
+    """
 
     cell: int
+    by: str = ""
+    reason: str = ""
+    since: float | None = None
+    expires: float = inf
 
 
 @dataclass(frozen=True, slots=True)

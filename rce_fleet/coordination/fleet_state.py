@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.cell_blocks import CellBlock
 from rce_fleet.coordination.changes import ChangeLog, FleetChanges
 from rce_fleet.coordination.indexes import FleetIndex
 from rce_fleet.coordination.ledger import CellLedger
@@ -33,8 +34,8 @@ class FleetState:
         ledger: Which robot claims which cell.
         blocked: Cells that were blocked; no robot claims one.
         pending: Cells that will be blocked once no robot claims them; no robot may enter one.
-        sensed: Those of both that robots' sensors found blocked, and people did not.
-        requested: Those of both that people blocked one by one.
+        sensed: Those of both that robots' sensors found blocked, and people did not; with who, and when.
+        requested: Those of both that people blocked one by one; with who, why and until when.
         zones: Zones of the map, and lanes.
         mode: The fleet's mode; counts for robots whose own mode is automatic.
         mode_reason: Why the fleet has its mode, and who set it.
@@ -50,8 +51,8 @@ class FleetState:
     ledger: CellLedger = field(default_factory=CellLedger)
     blocked: set[int] = field(default_factory=set)
     pending: set[int] = field(default_factory=set)
-    sensed: set[int] = field(default_factory=set)
-    requested: set[int] = field(default_factory=set)
+    sensed: dict[int, CellBlock] = field(default_factory=dict)
+    requested: dict[int, CellBlock] = field(default_factory=dict)
     zones: ZoneBook = field(default_factory=ZoneBook)
     mode: RobotMode = RobotMode.AUTOMATIC
     mode_reason: str = ""
@@ -110,6 +111,10 @@ class FleetState:
         """Return whether there is a reason to keep a cell blocked."""
         return cell in self.sensed or cell in self.requested or self.zones.blocks(cell) is not None
 
+    def block_of(self, cell: int) -> CellBlock | None:
+        """Return who blocked a cell, and why; None: at most a zone did."""
+        return self.requested.get(cell) or self.sensed.get(cell)
+
     def mode_of(self, record: RobotRecord) -> RobotMode:
         """Return the mode of a robot that counts."""
         mode = effective_mode(self.mode, record.mode)
@@ -156,14 +161,25 @@ class FleetState:
         self.map_version += 1
         self.log.note_cell(cell)
 
+    def put_block(self, cell: int, block: CellBlock) -> None:
+        """Note who blocked a cell, and why; a sensor does not take over what a person blocked."""
+        if not block.sensed:
+            self.sensed.pop(cell, None)
+        (self.sensed if block.sensed else self.requested)[cell] = block
+        self.log.note_cell(cell)
+
+    def drop_block(self, cell: int) -> None:
+        """Note that neither a person nor a sensor blocks a cell; a zone may."""
+        self.sensed.pop(cell, None)
+        self.requested.pop(cell, None)
+        self.log.note_cell(cell)
+
     def free(self, cell: int) -> None:
         """Let robots enter a cell again."""
         self.pending.discard(cell)
         self.blocked.discard(cell)
-        self.sensed.discard(cell)
-        self.requested.discard(cell)
+        self.drop_block(cell)
         self.map_version += 1
-        self.log.note_cell(cell)
 
     def refresh(self) -> None:
         """Update the indexes with the changes since the last call."""
@@ -187,7 +203,7 @@ class FleetState:
 
     def take_changes(self) -> FleetChanges | None:
         """Return the changes that are not published yet; None if there are none."""
-        return self.log.take(self.describe, self._cell_state, self.zones.zones)
+        return self.log.take(self.describe, self._cell_state, self.zones.zones, self.block_of)
 
     def snapshot(self) -> FleetSnapshot:
         """Return the state for publishing."""
@@ -195,6 +211,7 @@ class FleetState:
             robots=tuple(self._describe(self.robots[robot]) for robot in sorted(self.robots)),
             blocked=tuple(sorted(self.blocked)),
             pending=tuple(sorted(self.pending)),
+            blocks=tuple(sorted((self.sensed | self.requested).items())),
         )
 
     def describe(self, robot: str) -> RobotSnapshot | None:
@@ -212,8 +229,7 @@ class FleetState:
         self.index.validate(self.robots.values(), self.ledger)
         if self.blocked & (self.pending | self.grid.blocked) or self.pending & self.grid.blocked:
             raise InvariantError("a cell is a wall, blocked or pending, and only one of these")
-        if not self.sensed <= self.blocked | self.pending:
-            raise InvariantError(f"cells {self.sensed} were sensed and are not all blocked or pending")
+        self._validate_blocks()
         for record in self.robots.values():
             route, claims = self.ledger.route(record.id), self.ledger.claims(record.id)
             if not self.grid.is_path(route):
@@ -226,6 +242,13 @@ class FleetState:
                 raise InvariantError(f"{record.id} is active without a cell")
             if self.shut.intersection(route[1:]):
                 raise InvariantError(f"the route of {record.id} leads through blocked cells: {route}")
+
+    def _validate_blocks(self) -> None:
+        for what, blocks in (("sensed", self.sensed), ("requested", self.requested)):
+            if not blocks.keys() <= self.blocked | self.pending:
+                raise InvariantError(f"cells {sorted(blocks)} were {what} and are not all blocked or pending")
+        if both := self.sensed.keys() & self.requested.keys():
+            raise InvariantError(f"cells {sorted(both)} were both sensed and requested")
 
     def _cell_state(self, cell: int) -> bool | None:
         """Return whether a cell is blocked (True), pending (False) or neither (None)."""

@@ -13,7 +13,10 @@ from typing import Any
 MOST_EARLY = 256
 """Changes to keep while the complete state is requested; with more, it is requested again."""
 
-_CONTENT = ("robots", "removed", "blocked", "pending", "freed", "zones", "removed_zones")
+_CONTENT = (
+    *("robots", "removed", "blocked", "pending", "freed"),
+    *("zones", "removed_zones", "blocks", "removed_blocks"),
+)
 
 
 class ChangeFollower:

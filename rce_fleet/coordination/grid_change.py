@@ -17,8 +17,9 @@ from rce_fleet.coordination.robot import Phase, RobotRecord
 from rce_fleet.coordination.zones import ZoneKind, carried_zones
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
+    from rce_fleet.coordination.cell_blocks import CellBlock
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
     from rce_fleet.planning.grid import GridMap
@@ -65,18 +66,19 @@ def next_planner(planner: FleetPlanner, grid: GridMap, now: float) -> tuple[Flee
     old = planner.state
     newest = max((record.revision for record in old.robots.values()), default=0)
     made = FleetPlanner(grid, planner.settings, first_revision=newest)
-    by_people = carried_cells(old.grid, grid, old.requested)
+    by_people = _carried_blocks(old.grid, grid, old.requested)
     zones = carried_zones(old.zones.zones.values(), lambda cells: carried_cells(old.grid, grid, cells))
     made.state.zones.put(zones)
     made.state.mode, made.state.mode_reason = old.mode, old.mode_reason
     by_zones = {
         cell for zone in zones if zone.kind is ZoneKind.BLOCKED and not zone.robots for cell in zone.cells
     }
-    sensed = carried_cells(old.grid, grid, old.sensed) - by_people
-    for cell in sorted((by_people | by_zones | sensed) - grid.blocked):
-        made.state.block(cell)
-    made.state.requested |= by_people - grid.blocked
-    made.state.sensed |= sensed - grid.blocked
+    blocks = _carried_blocks(old.grid, grid, old.sensed) | by_people
+    for cell in sorted(blocks.keys() | by_zones):
+        if cell not in grid.blocked:
+            made.state.block(cell)
+            if cell in blocks:
+                made.state.put_block(cell, blocks[cell])
     instructions = made.handle(RobotsExpected(dict.fromkeys(planner.expected, ())), now)
     for record in old.robots.values():
         if not isnan(record.x):
@@ -100,6 +102,16 @@ def carried_cells(old: GridMap, new: GridMap, cells: Iterable[int]) -> set[int]:
                 at = new.cell_at(*old.point(row + 0.5 + up, column + 0.5 + along))
                 if at is not None:
                     found.add(at)
+    return found
+
+
+def _carried_blocks(old: GridMap, new: GridMap, blocks: Mapping[int, CellBlock]) -> dict[int, CellBlock]:
+    """Return who blocked cells of a new grid; where a cell overlaps several, the block that ends last."""
+    found: dict[int, CellBlock] = {}
+    for cell, block in sorted(blocks.items()):
+        for other in carried_cells(old, new, (cell,)):
+            if other not in found or found[other].expires < block.expires:
+                found[other] = block
     return found
 
 

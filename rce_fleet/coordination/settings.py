@@ -61,6 +61,8 @@ class FleetSettings:
         lost_yaw: The same for its heading, radians.
         obstacle_reach: Cells that a robot reports, blocked or free, and that are farther from it than this
             are ignored, metres; a cell's size is added.
+        sensed_lifetime: A cell that sensors found blocked is freed so long after a robot saw it blocked last;
+            0: never.
         jump_settle_time: A robot whose pose jumped keeps its cells for this time of steady poses.
         patience: A robot that has stood so long, with a path to its goal and no cell to drive to, is the
             first in the next plan for all; see :mod:`rce_fleet.coordination.starvation`.
@@ -101,6 +103,7 @@ class FleetSettings:
     lost_spread: float = 1.0
     lost_yaw: float = 1.0
     obstacle_reach: float = 10.0
+    sensed_lifetime: float = 0.0
     patience: float = 30.0
     visits_per_step: int = 4_000
     robots_per_step: int = 200

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rce_fleet.coordination.cell_blocks import CellBlock
 
 
 class RobotState(Enum):
@@ -80,8 +84,10 @@ class FleetSnapshot:
         robots: By name.
         blocked: Blocked cells without the map's walls, ascending.
         pending: Cells that will be blocked as soon as the robots in them have left, ascending.
+        blocks: Who blocked cells of both, and why, by cell; not of cells that only zones block.
     """
 
     robots: tuple[RobotSnapshot, ...]
     blocked: tuple[int, ...]
     pending: tuple[int, ...]
+    blocks: tuple[tuple[int, CellBlock], ...] = ()

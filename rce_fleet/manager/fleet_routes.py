@@ -8,6 +8,7 @@ from itertools import islice
 from typing import get_args
 
 from rce_fleet.api.fleet import (
+    CellBlockModel,
     EventModel,
     EventPage,
     FleetMapModel,
@@ -239,8 +240,11 @@ async def fleet_map(call: Call) -> FleetAnswer:
     lanes = call.manager.facts.lanes
     if grid is None:
         return problem(503, "the planner has not told its map yet; try again later")
-    blocked = [cell for cell in kept.cells if cell in grid]
+    present = {cell for cell in kept.cells if cell in grid and not kept.block(cell).has_ended(call.now)}
     freed = {*kept.unsent}.difference(kept.cells)
+    blocked = ({*call.manager.facts.shut, *present} - grid.blocked).difference(freed)
+    own = {cell: kept.blocks[cell] for cell in present & kept.blocks.keys()}
+    blocks = {**call.manager.facts.blocks, **own}
     return shown(
         FleetMapModel(
             rows=grid.rows,
@@ -249,7 +253,10 @@ async def fleet_map(call: Call) -> FleetAnswer:
             origin=list(grid.origin),
             yaw=grid.yaw,
             walls=sorted(grid.blocked),
-            blocked=sorted(({*call.manager.facts.shut, *blocked} - grid.blocked).difference(freed)),
+            blocked=sorted(blocked),
+            blocks=[
+                CellBlockModel(cell=cell, **asdict(blocks[cell])) for cell in sorted(blocks.keys() & blocked)
+            ],
             lanes=[LaneModel.model_validate(asdict(lane)) for lane in lanes.lanes] if lanes else [],
         )
     )

@@ -16,11 +16,12 @@ from rce_fleet.api.fleet import (
 )
 from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
 from rce_fleet.limits import MOST_CELL
+from rce_fleet.manager.cell_blocks import describe_block
 from rce_fleet.manager.goals import NO_ANSWER
 from rce_fleet.manager.planner_sync import BlockCell
 from rce_fleet.manager.requests import Call, FleetAnswer, Route, problem, shown
 from rce_fleet.manager.zones import checked
-from rce_fleet.tasks.records import Places, Zone
+from rce_fleet.tasks.records import NOT_KNOWN, CellBlock, Places, Zone
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -138,7 +139,7 @@ async def remove_zone(call: Call) -> FleetAnswer:
 
 async def set_cell(call: Call) -> FleetAnswer:
     """Block or free a cell; if the planner refuses, it stays as it was."""
-    name, blocked = call.names[0], call.model(CellChange).blocked
+    name, asked = call.names[0], call.model(CellChange)
     if not (name.isdecimal() and name.isascii() and len(name) <= MOST_DIGITS):
         return problem(404, f"{name[:MOST_DIGITS]!r} is not the number of a cell")
     cell = int(name)
@@ -146,21 +147,30 @@ async def set_cell(call: Call) -> FleetAnswer:
         return problem(404, f"cells have numbers up to {MOST_CELL}, not {cell}")
     check_cells(call, (cell,))
     async with call.manager.changes.hold("cell", str(cell)):
-        return await _set_cell(call, cell, blocked=blocked)
+        return await _set_cell(call, cell, asked)
 
 
-async def _set_cell(call: Call, cell: int, *, blocked: bool) -> FleetAnswer:
-    manager = call.manager
-    was_blocked = cell in manager.book.blocked.cells
-    made = manager.book.blocked.changed({cell: blocked}, unsent=True)
-    what, text = ("blocked", f"cell {cell} is blocked") if blocked else ("freed", f"cell {cell} is free")
-    if was_blocked != blocked:
-        manager.book.emit(made, what, manager.clock(), user=call.request.user, text=text)
+async def _set_cell(call: Call, cell: int, asked: CellChange) -> FleetAnswer:
+    manager, user, now = call.manager, call.request.user, call.manager.clock()
+    before, blocked = manager.book.blocked, asked.blocked
+    if blocked and asked.until is not None and asked.until <= now:
+        raise TaskRefusedError(f"cell {cell}: the end {asked.until:.0f} is not after now ({now:.0f})")
+    was_blocked, block = cell in before.cells, before.block(cell)
+    is_other = (block.reason, block.until) != (asked.reason, asked.until)
+    is_new = was_blocked != blocked or (blocked and is_other)
+    text = f"cell {cell} is {'blocked' if blocked else 'free'}"
+    if is_new:
+        block = CellBlock(user, asked.reason, now, asked.until) if blocked else NOT_KNOWN
+        made = before.changed({cell: blocked}, unsent=True, blocks={cell: block})
+        told = describe_block(cell, block) if blocked else text
+        manager.book.emit(made, "blocked" if blocked else "freed", now, user=user, text=told)
     await manager.commit()  # also if it is so already: that may not be in the journal yet
     # A cell that only sensors found blocked is freed as well, though the journal does not have it.
-    if refusal := await manager.tell(BlockCell(cell, blocked)):
-        if was_blocked != blocked and (cell in manager.book.blocked.cells) == blocked:
-            back = manager.book.blocked.changed({cell: was_blocked}, unsent=False)
+    if refusal := await manager.tell(BlockCell(cell, blocked, block)):
+        after = manager.book.blocked
+        if is_new and (cell in after.cells, after.block(cell)) == (blocked, block):
+            kept = {cell: before.blocks[cell]} if cell in before.blocks else {}
+            back = after.changed({cell: was_blocked}, unsent=False, blocks=kept)
             manager.book.emit(back, "refused", manager.clock(), text=f"cell {cell}: {refusal}")
             await manager.commit()
         if refusal.startswith(NO_ANSWER):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol, assert_never
 from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, SetMode, SetZone
 
 if TYPE_CHECKING:
-    from rce_fleet.tasks.records import Zone
+    from rce_fleet.tasks.records import CellBlock, Zone
 
 
 class PlannerLink(Protocol):
@@ -16,8 +16,8 @@ class PlannerLink(Protocol):
     async def set_goal(self, robot: str, cell: int | None) -> str:
         """Send a robot to a cell, or remove its goal."""
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        """Block or free a cell."""
+    async def block_cell(self, cell: int, block: CellBlock | None, now: float) -> str:
+        """Block a cell, or free it (None)."""
 
     async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
         """Set who drives a robot, or the fleet's mode (robot empty)."""
@@ -39,7 +39,7 @@ async def carry_out(planner: PlannerLink, call: PlannerCall, now: float) -> str:
             return await planner.set_mode(robot, mode, reason, user)
         case SetZone(name, zone):
             return await planner.set_zone(name, zone, now)
-        case BlockCell(cell, blocked):
-            return await planner.block_cell(cell, blocked=blocked)
+        case BlockCell(cell, blocked, block):
+            return await planner.block_cell(cell, block if blocked else None, now)
         case _:
             assert_never(call)

@@ -12,10 +12,20 @@ from math import inf
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.limits import MOST_LIFETIME
+from rce_fleet.manager.cell_blocks import describe_block
 from rce_fleet.manager.mirror import SETTLE_S, Mirror
 from rce_fleet.manager.zones import rule
 from rce_fleet.tasks.other_floor import leave_floor
-from rce_fleet.tasks.records import AUTOMATIC, BlockedCells, FleetEntry, PlannerRun, RobotEntry, Zone
+from rce_fleet.tasks.records import (
+    AUTOMATIC,
+    NOT_KNOWN,
+    BlockedCells,
+    CellBlock,
+    FleetEntry,
+    PlannerRun,
+    RobotEntry,
+    Zone,
+)
 
 if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
@@ -32,6 +42,9 @@ FLEET = ""
 _LATE_S = 1.0
 """So much later than in the journal a zone may end at the planner because it was told later."""
 _NOT_TOLD = 0, -inf
+_NEVER_TOLD = NOT_KNOWN, -inf
+_MOST_NAMED = 10
+"""So many cells are named in the text of one event."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +67,11 @@ class SetZone:
 
 @dataclass(frozen=True, slots=True)
 class BlockCell:
-    """Block or free a cell."""
+    """Block or free a cell; who blocks it, and why, is told with it."""
 
     cell: int
     blocked: bool
+    block: CellBlock = NOT_KNOWN
 
 
 PlannerCall: TypeAlias = SetMode | SetZone | BlockCell
@@ -79,6 +93,8 @@ class PlannerSync:
         self._cells: Mirror[int, bool] = Mirror(CELLS_DELAY_S)
         self._told: dict[str, tuple[int, float]] = {}
         """Which revision of a zone the planner accepted last, and when."""
+        self._told_blocks: dict[int, tuple[CellBlock, float]] = {}
+        """Who blocked a cell, and why, as the planner accepted it last, and when."""
         self._run = PlannerRun()
         self._unlisted: dict[int, float] = {}
         """Until when the planner's list need not have cells that are blocked since a robot has left them."""
@@ -110,6 +126,8 @@ class PlannerSync:
         # False: a stand-in that no cell equals, for those that the planner may not have, or still has.
         waiting = dict.fromkeys(() if is_other_floor else book.blocked.unsent, False)
         self._cells.restart({**told, **waiting} if keeps else {})
+        kept = book.blocked.cells if is_other_floor else ()
+        self._told_blocks = {cell: (book.blocked.block(cell), now) for cell in kept}
         self._facts.requested = None if keeps else frozenset()  # a planner that begins has no requests
         self._run = run
         self._unlisted.clear()
@@ -140,6 +158,7 @@ class PlannerSync:
                 if not is_sent:
                     self._zones.forget(zone.id)  # it may have been prolonged at a planner that is silent now
         if not is_comparable:
+            self._end_cells(now)
             return
         self._note_run(now)  # again, if the journal could not be written
         self._note_pending(now)
@@ -150,7 +169,9 @@ class PlannerSync:
             if zone_seen is None or key in book.zones or _end(facts.zones[key], now) > now + _LATE_S:
                 self._adopt_zone(key, zone_seen, now)
         if facts.requested is not None:
-            self._adopt_cells(self._cells.compare(*self._cells_of_both(), now).to_adopt, now)
+            changes = self._cells.compare(*self._cells_of_both(), now, self._untold_cells()).to_adopt
+            self._adopt_cells(changes, now)
+            self._adopt_blocks(now)
 
     def calls(self, now: float) -> list[PlannerCall]:
         """Return what the planner has to be told now; modes first.
@@ -167,8 +188,8 @@ class PlannerSync:
         for key in self._zones.compare(*self._zones_of_both(), now, self._untold()).to_send:
             out.append(SetZone(key, book.zones.get(key)))
         if self._facts.requested is not None:
-            cells = self._cells.compare(*self._cells_of_both(), now).to_send
-            out += [BlockCell(cell, bool(blocked)) for cell, blocked in cells.items()]
+            cells = self._cells.compare(*self._cells_of_both(), now, self._untold_cells()).to_send
+            out += [BlockCell(cell, bool(one), book.blocked.block(cell)) for cell, one in cells.items()]
         return out
 
     def took(self, call: PlannerCall, now: float, *, refused: bool) -> None:
@@ -187,6 +208,10 @@ class PlannerSync:
                 self._told[call.id] = call.zone.revision, now
         else:
             self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
+            if not refused:
+                self._told_blocks.pop(call.cell, None)
+            if call.blocked and not refused:
+                self._told_blocks[call.cell] = call.block, now
 
     def undo_zone(self, zone: Zone, before: Zone | None, now: float, refusal: str) -> bool:
         """Take back a zone that a request made, and that the planner refused; return whether it was there.
@@ -235,7 +260,12 @@ class PlannerSync:
     def _confirmed_cells(self) -> list[BlockedCells]:
         blocked = self._book.blocked
         kept = dict.fromkeys(blocked.cells, True)
-        waiting = tuple(cell for cell in blocked.unsent if not self._cells.is_known(cell, kept.get(cell)))
+        untold = self._untold_cells()
+        waiting = tuple(
+            cell
+            for cell in blocked.unsent
+            if cell in untold or not self._cells.is_known(cell, kept.get(cell))
+        )
         return [] if waiting == blocked.unsent else [replace(blocked, unsent=waiting)]
 
     # What both have
@@ -301,6 +331,15 @@ class PlannerSync:
         unsent = (zone for zone in self._book.zones.values() if zone.unsent)
         return {zone.id for zone in unsent if told.get(zone.id, _NOT_TOLD)[0] != zone.revision}
 
+    def _untold_cells(self) -> set[int]:
+        """Return blocked cells of which the planner was not told what a request changed, maybe only why."""
+        blocked, told = self._book.blocked, self._told_blocks
+        return {
+            cell
+            for cell in {*blocked.unsent} & {*blocked.cells}
+            if cell not in told or told[cell][0] != blocked.block(cell)
+        }
+
     def _zones_kept(self) -> dict[str, Zone]:
         return {zone.id: rule(zone) for zone in self._book.zones.values()}
 
@@ -350,12 +389,58 @@ class PlannerSync:
     def _adopt_cells(self, changes: dict[int, bool | None], now: float) -> None:
         if not changes:
             return
-        made = self._book.blocked.changed({cell: bool(one) for cell, one in changes.items()}, unsent=False)
-        self._book.emit(made, "blocked", now, text=f"{len(made.cells)} cells are blocked")
+        before = self._book.blocked
+        gone = [cell for cell, blocked in changes.items() if not blocked]
+        ended = [cell for cell in gone if before.block(cell).has_ended(now + _LATE_S)]
+        made = before.changed(
+            {cell: bool(one) for cell, one in changes.items()}, unsent=False, blocks=self._blocks_seen()
+        )
+        what, text = "blocked", f"{len(made.cells)} cells are blocked"
+        if len(ended) == len(changes):
+            what, text = "freed", _words_of_ended(ended)
+        users = {made.block(cell).user for cell in changes}
+        self._book.emit(made, what, now, user=users.pop() if len(users) == 1 else "", text=text)
+
+    def _blocks_seen(self) -> dict[int, CellBlock]:
+        """Return who blocked cells at the planner, without those that only sensors found blocked."""
+        return {cell: block for cell, block in self._facts.blocks.items() if not block.robot}
+
+    def _adopt_blocks(self, now: float) -> None:
+        """Take over who blocked cells, why and until when, where that was changed at the planner."""
+        blocked = self._book.blocked
+        found: dict[int, CellBlock] = {}
+        for cell in {*blocked.cells}.difference(blocked.unsent):
+            seen, (_, told_at) = self._facts.blocks.get(cell), self._told_blocks.get(cell, _NEVER_TOLD)
+            if seen is None or seen.robot or not self._cells.is_known(cell, value=True):
+                continue
+            known = blocked.block(cell)
+            is_other = (known.user, known.reason) != (seen.user, seen.reason)
+            is_other |= abs(_end(known, now) - _end(seen, now)) > ENDS_NEAR_S
+            if is_other and now >= told_at + SETTLE_S:
+                found[cell] = seen
+        if found:
+            made = blocked.changed(dict.fromkeys(found, True), unsent=False, blocks=found)
+            text = ", ".join(describe_block(cell, found[cell]) for cell in sorted(found)[:_MOST_NAMED])
+            self._book.emit(made, "blocked", now, text=text)
+
+    def _end_cells(self, now: float) -> None:
+        """End blocks whose time has come while the planner is silent; one that is heard frees them itself."""
+        blocked = self._book.blocked
+        ended = [cell for cell in blocked.cells if blocked.block(cell).has_ended(now - CELLS_DELAY_S)]
+        if ended:
+            made = blocked.changed(dict.fromkeys(ended, False), unsent=False)
+            self._book.emit(made, "freed", now, text=_words_of_ended(ended))
+            for cell in ended:
+                self._cells.forget(cell)  # it may have been blocked again at a planner that is silent now
 
 
-def _end(zone: Zone, now: float) -> float:
-    """Return when a zone ends; infinity also if it is so late that the planner cannot be told the time."""
+def _words_of_ended(cells: list[int]) -> str:
+    named = ", ".join(map(str, cells[:_MOST_NAMED]))
+    return f"the time of blocked cells has ended: {named}" + (" ..." if len(cells) > _MOST_NAMED else "")
+
+
+def _end(zone: Zone | CellBlock, now: float) -> float:
+    """Return when a zone or block ends; infinity also if it is too late to tell the planner the time."""
     until = inf if zone.until is None else zone.until
     return until if until < now + MOST_LIFETIME / 2 else inf
 

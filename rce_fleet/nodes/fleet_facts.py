@@ -8,6 +8,7 @@ from typing import Any
 
 from rce_fleet.coordination.following import ChangeFollower
 from rce_fleet.coordination.waiting import resting_cell
+from rce_fleet.manager.cell_blocks import read_block
 from rce_fleet.manager.zones import read_zone
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import Lane, LaneGraph
@@ -96,6 +97,8 @@ class FactKeeper:
         for robot in state["robots"]:
             self._take_robot(robot, now)
         self._facts.zones = {zone["id"]: read_zone(zone, now) for zone in state["zones"]}
+        told = state.get("blocks", ())  # planners of earlier releases tell none
+        self._facts.blocks = {block["cell"]: read_block(block, now) for block in told}
         self._facts.mode = state["mode"]
         self._note_map()
         self._facts.is_live = True
@@ -157,6 +160,10 @@ class FactKeeper:
             self._facts.zones.pop(zone, None)
         for zone in message["zones"]:
             self._facts.zones[zone["id"]] = read_zone(zone, now)
+        for cell in message.get("removed_blocks", ()):
+            self._facts.blocks.pop(cell, None)
+        for block in message.get("blocks", ()):
+            self._facts.blocks[block["cell"]] = read_block(block, now)
         if message["blocked"] or message["pending"] or message["freed"]:
             freed = set(message["freed"])
             blocked, pending = set(message["blocked"]), set(message["pending"])

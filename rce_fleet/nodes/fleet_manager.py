@@ -24,6 +24,7 @@ from rce.ros.tools.plain import plain
 from rce.ros.types import TypesError
 from rce_fleet.exceptions import JournalError, JournalInUseError
 from rce_fleet.journal.journal import Journal
+from rce_fleet.manager.cell_blocks import block_request
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import NO_ANSWER
 from rce_fleet.manager.manager import FleetManager
@@ -41,7 +42,7 @@ from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
 from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
-from rce_fleet.tasks.records import Places, Zone
+from rce_fleet.tasks.records import CellBlock, Places, Zone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -85,9 +86,15 @@ class PlannerServices:
         """Send a robot to a cell, or remove its goal; return why the planner refused."""
         return await self._call(self._set_goal, robot=robot, cell=-1 if cell is None else cell)
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        """Block or free a cell; return why the planner refused."""
-        return await self._call(self._block_cell, cell=cell, blocked=blocked)
+    async def block_cell(self, cell: int, block: CellBlock | None, now: float) -> str:
+        """Block a cell, or free it (None); return why the planner refused.
+
+        Args:
+            cell: The cell.
+            block: Who blocks it, and why.
+            now: Seconds since 1970.
+        """
+        return await self._call(self._block_cell, **block_request(cell, block, now))
 
     async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
         """Set who drives a robot, or the fleet's mode (robot empty); return why the planner refused."""

@@ -20,7 +20,6 @@ from rce.ros.node import Node, run
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
-    CellFreed,
     CellsIgnored,
     Event,
     GoalSet,
@@ -38,6 +37,7 @@ from rce_fleet.coordination.grid_change import next_planner, refuse_grid
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import LanesError, MapError, PlannerError, ZoneError
+from rce_fleet.nodes.block_messages import read_cell_request
 from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
@@ -123,7 +123,7 @@ class PlannerNode:
         self._publish_blocked(())
         await self._expect_known()
         for cell in blocked:
-            self._handle(CellBlocked(cell))
+            self._handle(CellBlocked(cell, reason="parameter of the planner"))
         await node.advertise_service(SERVICE, "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
@@ -223,7 +223,10 @@ class PlannerNode:
         return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
 
     def _block_cell(self, request: Message) -> dict[str, Any]:
-        return self._ask(CellBlocked(request.cell) if request.blocked else CellFreed(request.cell))
+        try:
+            return self._ask(read_cell_request(request, time.monotonic()))
+        except ValueError as error:
+            return {"ok": False, "message": str(error)}
 
     def _remove_robot(self, request: Message) -> dict[str, Any]:
         return self._ask(RobotRemoved(request.robot))

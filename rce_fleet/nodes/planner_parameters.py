@@ -23,7 +23,7 @@ KNOWN = GRID_PARAMETERS | frozenset(
     {
         *("blocked", "lanes", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots", "plan_timeout"),
-        *("improve_seconds", "learn_congestion", "obstacle_reach"),
+        *("improve_seconds", "learn_congestion", "obstacle_reach", "sensed_lifetime"),
     }
 )
 """Names of all parameters."""
@@ -48,6 +48,7 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         lost_spread=read_number(values, "lost_spread", default.lost_spread),
         lost_yaw=read_number(values, "lost_yaw", default.lost_yaw),
         obstacle_reach=read_number(values, "obstacle_reach", default.obstacle_reach),
+        sensed_lifetime=read_number(values, "sensed_lifetime", default.sensed_lifetime),
         plan_timeout=read_number(values, "plan_timeout", default.plan_timeout),
         planner=str(values.get("planner", default.planner)),
         resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
@@ -60,8 +61,9 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
     for name in (*above_zero, "plan_timeout"):
         if getattr(settings, name) <= 0:
             raise ValueError(f"the parameter {name} must be above 0, not {getattr(settings, name):g}")
-    if settings.improve_seconds < 0:
-        raise ValueError(f"the parameter improve_seconds must be 0 or more, not {settings.improve_seconds:g}")
+    for name in ("improve_seconds", "sensed_lifetime"):
+        if getattr(settings, name) < 0:
+            raise ValueError(f"the parameter {name} must be 0 or more, not {getattr(settings, name):g}")
     Motion(settings.quarter_turn, settings.stop)  # an impossible value has its reason
     if settings.planner not in planner_names():
         known = ", ".join(planner_names())

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types import Message, Time
+from rce_fleet.nodes.block_messages import block_fields
 from rce_fleet.nodes.zone_messages import zone_fields
 
 if TYPE_CHECKING:
@@ -113,6 +114,7 @@ def state_fields(started: Time, planner: FleetPlanner, now: float = 0.0) -> dict
         "planner": planner.settings.planner,
         "zones": [zone_fields(zone, now) for _, zone in sorted(planner.state.zones.zones.items())],
         "lanes": [] if planner.state.zones.lanes is None else lane_fields(planner.state.zones.lanes),
+        "blocks": [block_fields(cell, block, now) for cell, block in snapshot.blocks],
         **fleet_fields(planner),
     }
 
@@ -150,6 +152,8 @@ def changes_fields(
         "freed": list(changes.freed),
         "zones": [zone_fields(zone, now) for zone in changes.zones],
         "removed_zones": list(changes.removed_zones),
+        "blocks": [block_fields(cell, block, now) for cell, block in changes.blocks],
+        "removed_blocks": list(changes.removed_blocks),
     }
 
 

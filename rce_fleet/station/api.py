@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from rce_fleet.api.fleet import LaneModel
+from rce_fleet.api.fleet import CellBlockModel, CellChange, LaneModel
 from rce_fleet.api.tasks import numbers_only
 
 MAX_CELL = 2**31 - 1
@@ -23,10 +23,8 @@ class GoalRequest(_Model):
     cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0, le=MAX_CELL)
 
 
-class CellRequest(_Model):
-    """Whether a cell is blocked."""
-
-    blocked: bool
+class CellRequest(CellChange):
+    """Whether a cell is blocked, why, and until when."""
 
 
 class GridRequest(_Model):
@@ -155,6 +153,10 @@ class FleetModel(_Model):
     robots: list[RobotModel]
     blocked: list[int]
     pending: list[int] = Field(description="Cells that will be blocked once a robot has left them.")
+    blocks: list[CellBlockModel] = Field(
+        default_factory=list,
+        description="Who blocked cells of both lists, and why, by cell; not of cells that only zones block.",
+    )
     age: float | None = Field(
         default=None,
         description="Seconds since the planner was heard last: it sends something every second; null: never.",

@@ -25,10 +25,39 @@ class DesiredGoal:
 
 @dataclass(frozen=True, slots=True)
 class DesiredCell:
-    """A cell shall be blocked, or free."""
+    """A cell shall be blocked, or free.
+
+    Attributes:
+        cell: The cell.
+        blocked: Whether it shall be blocked.
+        user: Who blocked it.
+        reason: Why, for people.
+        since: When it was blocked, seconds since 1970; None: now.
+        until: When it is freed, seconds since 1970; None: it stays blocked.
+    """
 
     cell: int
     blocked: bool
+    user: str = ""
+    reason: str = ""
+    since: float | None = None
+    until: float | None = None
+
+    def has_ended(self, now: float) -> bool:
+        """Return whether its time has come, at ``now`` in seconds since 1970."""
+        return self.until is not None and self.until <= now
+
+    def request(self, now: float) -> dict[str, Any]:
+        """Return a ``fleet/BlockCell`` request, at ``now`` in seconds since 1970."""
+        told = {
+            "by": self.user,
+            "reason": self.reason,
+            "age": 0.0 if self.since is None else max(now - self.since, 0.0),
+            "lifetime": 0.0 if self.until is None else max(self.until - now, 0.001),
+        }
+        # Planners of earlier releases do not know these fields.
+        given = {name: value for name, value in told.items() if value} if self.blocked else {}
+        return {"cell": self.cell, "blocked": self.blocked, **given}
 
 
 class Desired:
@@ -36,7 +65,7 @@ class Desired:
 
     def __init__(self) -> None:
         self._goals: dict[str, int] = {}
-        self._cells: dict[int, bool] = {}
+        self._cells: dict[int, DesiredCell] = {}
 
     def set_goal(self, robot: str, cell: int | None) -> None:
         """Store a goal that the planner accepted; None removes it."""
@@ -45,9 +74,9 @@ class Desired:
         else:
             self._goals[robot] = cell
 
-    def set_cell(self, cell: int, *, blocked: bool) -> None:
-        """Store whether the planner blocked or freed a cell."""
-        self._cells[cell] = blocked
+    def set_cell(self, wanted: DesiredCell) -> None:
+        """Store that the planner blocked or freed a cell."""
+        self._cells[wanted.cell] = wanted
 
     def forget_cell(self, cell: int) -> None:
         """Forget a cell: the fleet manager keeps it."""
@@ -65,24 +94,28 @@ class Desired:
     def holds(self, desired: DesiredCell | DesiredGoal) -> bool:
         """Return whether this is still the newest request for its robot or cell."""
         match desired:
-            case DesiredCell(cell, blocked):
-                return self._cells.get(cell) is blocked
+            case DesiredCell(cell):
+                return self._cells.get(cell) == desired
             case DesiredGoal(robot, cell):
                 return self._goals.get(robot) == cell
             case _:
                 assert_never(desired)
 
-    def unmet(self, state: dict[str, Any]) -> list[DesiredCell | DesiredGoal]:
-        """Return what is missing in a planner's ``state`` (a fleet/FleetState in its JSON form).
+    def unmet(self, state: dict[str, Any], now: float = 0.0) -> list[DesiredCell | DesiredGoal]:
+        """Return what is missing in a planner's state.
 
         Cells come first, so that no path is planned through them. Robots that the planner does not know yet,
-        or that have another goal, are left out.
+        or that have another goal, are left out, and cells whose time has come.
+
+        Args:
+            state: A ``fleet/FleetState`` in its JSON form.
+            now: Seconds since 1970.
         """
         shut = {*state["blocked"], *state["pending"]}
         cells = [
-            DesiredCell(cell, blocked)
-            for cell, blocked in self._cells.items()
-            if blocked != (cell in shut) and cell not in state["walls"]
+            wanted
+            for cell, wanted in self._cells.items()
+            if wanted.blocked != (cell in shut) and cell not in state["walls"] and not wanted.has_ended(now)
         ]
         goals = [
             DesiredGoal(robot["id"], self._goals[robot["id"]])

@@ -87,6 +87,8 @@ class Feed:
                     "blocked": change.blocked,
                     "pending": change.pending,
                     "freed": change.freed,
+                    "blocks": self._view.blocks(change.blocks),
+                    "removed_blocks": change.removed_blocks,
                 },
             )
         )
@@ -164,6 +166,7 @@ class Feed:
                 "robots": self._robots(names),
                 "blocked": self._view.blocked(),
                 "pending": self._view.pending(),
+                "blocks": self._view.blocks(),
             }
             self._all[compact] = [_text("map", grid), _text("state", state)]
             if not compact:

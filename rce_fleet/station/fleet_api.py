@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from rce.web.routes import Route
 from rce_fleet.api.fleet import EventPage
 from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookRequest
 from rce_fleet.station.access import with_known_query
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.event_streams import CSV, EVENT_STREAM, EventStreams, Work
 from rce_fleet.station.events import EventBatch, EventFeed
 from rce_fleet.station.figures import STATISTICS_PATH
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
     from rce_fleet.station.access import AccessControl
+    from rce_fleet.station.api import CellRequest
     from rce_fleet.station.authentication import StationUser
     from rce_fleet.station.fleet_link import FleetLink
 
@@ -145,22 +148,22 @@ class FleetApi:
         self._fleet.forget_goal(robot)
         return said
 
-    async def block_cell(self, cell: int, *, blocked: bool, user: StationUser) -> str:
+    async def block_cell(self, cell: int, asked: CellRequest, *, user: StationUser) -> str:
         """Block or free a cell; return the answer for people.
 
         It is kept as a goal is.
 
         Args:
             cell: The cell.
-            blocked: Whether to block it.
+            asked: Whether to block it, why, and until when.
             user: Who asks.
 
         Raises:
             PlannerError: It was refused, or neither of them answers.
         """
-        said = await self._by_manager(f"/cells/{cell}", {"blocked": blocked}, user)
+        said = await self._by_manager(f"/cells/{cell}", asked.model_dump(exclude_defaults=True), user)
         if said is None:
-            said = await self._fleet.block_cell(cell, blocked=blocked)
+            said = await self._fleet.block_cell(_desired(cell, asked, user))
             if not self.manager.here:
                 return said
         self._fleet.forget_cell(cell)
@@ -213,6 +216,20 @@ class FleetApi:
             raise PlannerUnavailableError(f"the fleet manager has no events now: {answer['body']}")
         page = json.loads(answer["body"])
         return EventBatch(page["events"], page["journal"], page["newest"])
+
+
+def _desired(cell: int, asked: CellRequest, user: StationUser) -> DesiredCell:
+    """Return what a user wants of a cell.
+
+    Raises:
+        PlannerError: Its end has passed.
+    """
+    if not asked.blocked:
+        return DesiredCell(cell, blocked=False)
+    now = time.time()
+    if asked.until is not None and asked.until <= now:
+        raise PlannerError(f"cell {cell}: the end {asked.until:.0f} is not after now ({now:.0f})")
+    return DesiredCell(cell, True, user.name, asked.reason, now, asked.until)
 
 
 def _own_routes(streams: EventStreams, hooks: Webhooks) -> list[Route[Work]]:

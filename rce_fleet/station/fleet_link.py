@@ -123,15 +123,15 @@ class FleetLink:
             self._desired.set_goal(robot, cell)
         return said
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+    async def block_cell(self, wanted: DesiredCell) -> str:
         """Block or free a cell; return the planner's answer.
 
         Raises:
             PlannerError: The planner refused, or cannot be reached.
         """
-        with self._asking(cell):
-            said = await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
-            self._desired.set_cell(cell, blocked=blocked)
+        with self._asking(wanted.cell):
+            said = await self._call(BLOCK_CELL, wanted.request(time.time()))
+            self._desired.set_cell(wanted)
         return said
 
     def forget_cell(self, cell: int) -> None:
@@ -269,9 +269,9 @@ class FleetLink:
             self._state_needed.clear()
             early = self._follower.take_snapshot(answer)
             self._client.stop_states()
-            self._take(answer["state"]["started"], self._view.on_state(answer["state"]))
+            self._take(answer["state"]["started"], self._view.on_state(answer["state"], time.time()))
             for message in early:
-                self._take(message["started"], self._view.on_changes(message))
+                self._take(message["started"], self._view.on_changes(message, time.time()))
             self._request_if_behind()
 
     async def _notice_silence(self) -> None:
@@ -307,14 +307,15 @@ class FleetLink:
             self._state_needed.set()
 
     async def _send_unmet(self) -> None:
-        for desired in self._desired.unmet(self._view.state) if self._view.state else ():
+        state, now = self._view.state, time.time()
+        for desired in self._desired.unmet(state, now) if state else ():
             if not self._desired.holds(desired):  # changed while those before it were sent
                 continue
             with contextlib.suppress(PlannerError):
                 match desired:
-                    case DesiredCell(cell, blocked):
+                    case DesiredCell(cell):
                         if cell not in self._unanswered:
-                            await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
+                            await self._call(BLOCK_CELL, desired.request(time.time()))
                     case DesiredGoal(robot, cell):
                         if robot not in self._unanswered:
                             await self._call(SET_GOAL, {"robot": robot, "cell": cell})
@@ -328,7 +329,7 @@ class FleetLink:
         self._note_heard()
         if self._follower.follows:
             return
-        self._take(message["started"], self._view.on_state(message))
+        self._take(message["started"], self._view.on_state(message, time.time()))
         if self._asked_in_vain and not self._told and not self._changes_came.is_set():
             self._told = True
             self._on_event("the planner publishes no changes; following its complete state instead", "warn")
@@ -339,7 +340,7 @@ class FleetLink:
         self._changes_at = _now()
         self._changes_came.set()
         if self._follower.take_changes(message):
-            self._take(message["started"], self._view.on_changes(message))
+            self._take(message["started"], self._view.on_changes(message, time.time()))
         self._request_if_behind()
 
     def may_have_missed(self) -> None:

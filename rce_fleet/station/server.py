@@ -17,6 +17,7 @@ from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
+from rce_fleet.api.fleet import CellBlockModel
 from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
 from rce_fleet.station import masters_watch, replay_routes, world_link
 from rce_fleet.station.access import (
@@ -250,6 +251,7 @@ class Station:
                 robots=[self._model(robot, now) for robot in self._view.robots()],
                 blocked=self._view.blocked(),
                 pending=self._view.pending(),
+                blocks=[CellBlockModel(**block) for block in self._view.blocks()],
                 age=self._view.planner_age(now),
             )
         )
@@ -305,8 +307,9 @@ class Station:
             return refusal
         asked = CellRequest.model_validate_json(await self._access.read_body(request))
         user = request[USER]
-        message = await self.fleet_api.block_cell(int(number), blocked=asked.blocked, user=user)
-        self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
+        message = await self.fleet_api.block_cell(int(number), asked, user=user)
+        detail = asked.reason if asked.blocked else ""
+        self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number, detail)
         return _reply(Answer(message=message))
 
     @ROUTES.route(

@@ -8,6 +8,7 @@ from math import isfinite
 from typing import Any
 
 from rce_fleet.geometry.angles import yaw_of
+from rce_fleet.station.cell_blocks import Block, is_same, read_block
 
 ROBOT_RADIUS = 0.22
 """Radius of the robots as the page draws them, metres."""
@@ -43,6 +44,8 @@ class ViewChange:
         blocked: Cells that became blocked, ascending.
         pending: Cells that will be blocked once a robot has left them, ascending.
         freed: Cells that are not blocked or pending any more, ascending.
+        blocks: Cells that a person or a sensor blocked, or of which who or why changed, ascending.
+        removed_blocks: Cells that neither blocks any more, ascending.
     """
 
     is_new_map: bool = False
@@ -52,6 +55,8 @@ class ViewChange:
     blocked: tuple[int, ...] = ()
     pending: tuple[int, ...] = ()
     freed: tuple[int, ...] = ()
+    blocks: tuple[int, ...] = ()
+    removed_blocks: tuple[int, ...] = ()
 
     def __bool__(self) -> bool:
         return self != _NOTHING
@@ -79,6 +84,7 @@ class FleetView:
     _robots: dict[str, dict[str, Any]] = field(default_factory=dict)
     _blocked: set[int] = field(default_factory=set)
     _pending: set[int] = field(default_factory=set)
+    _blocks: dict[int, Block] = field(default_factory=dict)
 
     @property
     def state(self) -> dict[str, Any] | None:
@@ -92,12 +98,15 @@ class FleetView:
             "pending": self.pending(),
         }
 
-    def on_state(self, message: dict[str, Any]) -> ViewChange:
-        """Set the complete state; remove what is not in it."""
+    def on_state(self, message: dict[str, Any], now: float = 0.0) -> ViewChange:
+        """Set the complete state, which came ``now`` (seconds since 1970); remove what is not in it."""
         grid = {key: message[key] for key in _MAP}
         grid["lanes"] = message.get("lanes", [])  # planners of earlier releases tell none
         robots = {robot["id"]: robot for robot in message["robots"]}
         blocked, pending = set(message["blocked"]), set(message["pending"])
+        told = message.get("blocks", ())  # planners of earlier releases tell none
+        blocks = {block["cell"]: read_block(block, now) for block in told}
+        new_blocks = {cell for cell, block in blocks.items() if not is_same(block, self._blocks.get(cell))}
         change = ViewChange(
             is_new_map=grid != self._map,
             is_new_mode=self._set_mode(message),
@@ -106,7 +115,10 @@ class FleetView:
             blocked=_ascending(blocked - self._blocked),
             pending=_ascending(pending - self._pending),
             freed=_ascending((self._blocked | self._pending) - blocked - pending),
+            blocks=tuple(sorted(new_blocks)),
+            removed_blocks=tuple(sorted(self._blocks.keys() - blocks.keys())),
         )
+        self._blocks = {cell: blocks[cell] if cell in new_blocks else self._blocks[cell] for cell in blocks}
         self.planner_run = message.get("started", "")
         self._map, self._robots, self._blocked, self._pending = grid, robots, blocked, pending
         for robot in self.poses.keys() - robots.keys():
@@ -123,8 +135,8 @@ class FleetView:
         self._yaw = yaw
         return ViewChange(is_new_map=self._map is not None)
 
-    def on_changes(self, message: dict[str, Any]) -> ViewChange:
-        """Apply a ``fleet/FleetChanges`` that follows the known state."""
+    def on_changes(self, message: dict[str, Any], now: float = 0.0) -> ViewChange:
+        """Apply a ``fleet/FleetChanges`` that follows the known state, and came ``now`` (s since 1970)."""
         for robot in message["robots"]:
             self._robots[robot["id"]] = robot
         for name in message["removed"]:
@@ -134,6 +146,11 @@ class FleetView:
         blocked, pending, freed = (set(message[part]) for part in ("blocked", "pending", "freed"))
         self._blocked = (self._blocked | blocked) - pending - freed
         self._pending = (self._pending | pending) - blocked - freed
+        blocks = {block["cell"]: read_block(block, now) for block in message.get("blocks", ())}
+        removed_blocks = tuple(message.get("removed_blocks", ()))
+        for cell in removed_blocks:
+            self._blocks.pop(cell, None)
+        self._blocks |= blocks
         return ViewChange(
             is_new_mode=self._set_mode(message),
             robots=tuple(sorted(robot["id"] for robot in message["robots"])),
@@ -141,6 +158,8 @@ class FleetView:
             blocked=_ascending(blocked),
             pending=_ascending(pending),
             freed=_ascending(freed),
+            blocks=tuple(sorted(blocks)),
+            removed_blocks=removed_blocks,
         )
 
     def _set_mode(self, message: dict[str, Any]) -> bool:
@@ -235,6 +254,15 @@ class FleetView:
     def pending(self) -> list[int]:
         """Return the cells that will be blocked once a robot has left them, ascending."""
         return sorted(self._pending)
+
+    def blocks(self, cells: Iterable[int] | None = None) -> list[Block]:
+        """Return who blocked cells, and why.
+
+        Args:
+            cells: The cells; all that a person or a sensor blocked, ascending, if None.
+        """
+        wanted = sorted(self._blocks) if cells is None else cells
+        return [self._blocks[cell] for cell in wanted if cell in self._blocks]
 
 
 def _ascending(cells: set[int]) -> tuple[int, ...]:

@@ -63,7 +63,7 @@ def clamped(record: Record) -> Record:
         case Zone():
             made = _zone(record)
         case BlockedCells():
-            made = BlockedCells(_possible(record.cells), _possible(record.unsent))
+            made = _blocked(record)
         case RobotEntry() | GoalEntry() | FleetEntry() | PlannerRun():
             made = record
         case _:
@@ -112,6 +112,15 @@ def _zone(zone: Zone) -> Zone:
         edges=tuple(edge for edge in zone.edges if _possible(edge) == edge),
         until=_time(zone.until),
     )
+
+
+def _blocked(record: BlockedCells) -> BlockedCells:
+    blocks = {
+        cell: replace(block, since=_time(block.since), until=_time(block.until))
+        for cell, block in record.blocks.items()
+        if 0 <= cell <= MOST_CELL
+    }
+    return BlockedCells(_possible(record.cells), _possible(record.unsent), blocks)
 
 
 def _time(seconds: float | None) -> float | None:

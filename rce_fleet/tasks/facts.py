@@ -11,7 +11,7 @@ from rce_fleet.tasks.records import AUTOMATIC
 if TYPE_CHECKING:
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.planning.lanes import LaneGraph
-    from rce_fleet.tasks.records import Zone
+    from rce_fleet.tasks.records import CellBlock, Zone
 
 AT_REST = frozenset({"idle", "arrived"})
 """States of the planner in which a robot has nothing to do."""
@@ -89,6 +89,7 @@ class FleetFacts:
         zones: The planner's zones, by name.
         pending: Cells that will be blocked once a robot has left them.
         requested: Cells that people blocked, as the planner says; None: it has not said so since it began.
+        blocks: Who blocked cells, and why, by cell: people one by one, or robots' sensors.
         clock_steps: When the clock was set forward, by the time before, and by how many seconds.
     """
 
@@ -103,6 +104,7 @@ class FleetFacts:
     zones: dict[str, Zone] = field(default_factory=dict)
     pending: frozenset[int] = frozenset()
     requested: frozenset[int] | None = None
+    blocks: dict[int, CellBlock] = field(default_factory=dict)
     clock_steps: list[tuple[float, float]] = field(default_factory=list)
 
     def skip(self, seconds: float, now: float) -> None:

@@ -205,28 +205,70 @@ class Zone:
 
 
 @dataclass(frozen=True, slots=True)
+class CellBlock:
+    """Who blocked a cell, why, since when and until when.
+
+    Attributes:
+        user: Who blocked it; empty: a robot's sensor, or not told.
+        reason: Why, for people.
+        since: When it was blocked, seconds since 1970; None: not told.
+        until: When it is freed, seconds since 1970; None: it stays blocked.
+        robot: The robot whose sensor found it blocked; empty: people blocked it.
+    """
+
+    user: str = ""
+    reason: str = ""
+    since: float | None = None
+    until: float | None = None
+    robot: str = ""
+
+    def has_ended(self, now: float) -> bool:
+        """Return whether its time has come, at ``now`` in seconds since 1970."""
+        return self.until is not None and self.until <= now
+
+
+NOT_KNOWN = CellBlock()
+"""Of a cell of which is not known who blocked it: journals of earlier releases do not tell."""
+
+
+@dataclass(frozen=True, slots=True)
 class BlockedCells:
     """Cells that people blocked, to send them again to a planner that was restarted.
 
     Attributes:
         cells: The cells, ascending.
         unsent: Cells that requests blocked or freed, and the planner has not confirmed yet; ascending.
+        blocks: Who blocked which of the cells, and why; journals of earlier releases have none.
     """
 
     cells: tuple[int, ...] = ()
     unsent: tuple[int, ...] = ()
+    blocks: dict[int, CellBlock] = field(default_factory=dict)
 
-    def changed(self, changes: Mapping[int, bool], *, unsent: bool) -> BlockedCells:
+    def block(self, cell: int) -> CellBlock:
+        """Return who blocked one of the cells, and why, as far as that is known."""
+        return self.blocks.get(cell, NOT_KNOWN)
+
+    def changed(
+        self, changes: Mapping[int, bool], *, unsent: bool, blocks: Mapping[int, CellBlock] | None = None
+    ) -> BlockedCells:
         """Return the cells after some were blocked (True) or freed.
 
         Args:
             changes: The cells.
             unsent: Whether the planner has to be told.
+            blocks: Who blocked them, and why, as far as that is known.
         """
         kept = {*self.cells} - {*changes}
         waiting = {*self.unsent} - {*changes}
         kept |= {cell for cell, blocked in changes.items() if blocked}
-        return BlockedCells(tuple(sorted(kept)), tuple(sorted(waiting | {*changes} if unsent else waiting)))
+        told = {cell: block for cell, block in self.blocks.items() if cell not in changes}
+        told |= {cell: block for cell, block in (blocks or {}).items() if cell in changes}
+        return BlockedCells(
+            tuple(sorted(kept)),
+            tuple(sorted(waiting | {*changes} if unsent else waiting)),
+            {cell: told[cell] for cell in sorted(told.keys() & kept)},
+        )
 
 
 Record: TypeAlias = Task | RobotEntry | GoalEntry | FleetEntry | PlannerRun | Places | Zone | BlockedCells

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rce_fleet.journal.journal import Journal
+from rce_fleet.manager.cell_blocks import block_request
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.manager import FleetManager
 from rce_fleet.manager.requests import FleetRequest, Router
@@ -15,7 +16,7 @@ from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
 from rce_fleet.manager.zones import zone_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
-from rce_fleet.tasks.records import Zone
+from rce_fleet.tasks.records import CellBlock, Zone
 
 GO = {"stops": [{"cell": 5}]}
 
@@ -26,14 +27,17 @@ class Planner:
     def __init__(self) -> None:
         self.goals: dict[str, int | None] = {}
         self.calls: list[tuple[Any, ...]] = []
+        self.requests: list[dict[str, Any]] = []
+        """Requests to block or free cells, as the planner gets them."""
         self.refusal = ""
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         self.goals[robot] = cell
         return ""
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        self.calls.append(("cell", cell, blocked))
+    async def block_cell(self, cell: int, block: CellBlock | None, now: float) -> str:
+        self.calls.append(("cell", cell, block is not None))
+        self.requests.append(block_request(cell, block, now))
         return self.refusal
 
     async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:

@@ -45,6 +45,9 @@ class Both:
         elif isinstance(call, BlockCell):
             assert facts.requested is not None
             facts.requested = facts.requested | {call.cell} if call.blocked else facts.requested - {call.cell}
+            facts.blocks.pop(call.cell, None)
+            if call.blocked:
+                facts.blocks[call.cell] = call.block
         elif call.zone is None:
             del facts.zones[call.id]
         else:

@@ -180,12 +180,18 @@ export class Actions {
     const changed = cells.length === 1 ? cells : cells.filter((cell) => !this.fleet.walls.has(cell) && (this.fleet.blocked.has(cell) || this.fleet.pending.has(cell)) !== blocked);
     if (!changed.length) return null;
     const text = (value, count) => t(value ? "action.block.done" : "action.free.done", { count });
+    // A cell that is blocked again, as by an undo, keeps reason and end.
+    const before = new Map(changed.map((cell) => [cell, this.fleet.blocks.get(cell)]));
+    const request = (cell) => {
+      const { reason, until } = before.get(cell) ?? {};
+      return { blocked: true, ...(reason && { reason }), ...(until && { until }) };
+    };
     const set = async (value, wanted) => {
       const [done, missed] = [[], []];
       let [answer, refusal] = [null, null];
       for (const cell of wanted) {
         try {
-          answer = await ask("PUT", `/cells/${cell}`, { blocked: value });
+          answer = await ask("PUT", `/cells/${cell}`, value ? request(cell) : { blocked: false });
           done.push(cell);
         } catch (error) {
           refusal = error;

@@ -133,6 +133,14 @@ view.canvas.addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
+// Who blocked the cell under the pointer, and why.
+view.canvas.addEventListener("pointermove", () => {
+  const { cursor } = view;
+  const isBlocked = cursor !== null && replay.at === null && !fleet.walls.has(cursor) && (fleet.blocked.has(cursor) || fleet.pending.has(cursor));
+  const text = isBlocked ? describeCell(fleet, work.zones, cursor) : "";
+  if (view.canvas.title !== text) view.canvas.title = text;
+});
+
 at("#zoom-in").addEventListener("click", () => view.camera.zoom(1.5));
 at("#zoom-out").addEventListener("click", () => view.camera.zoom(1 / 1.5));
 at("#zoom-fit").addEventListener("click", () => view.camera.fit());

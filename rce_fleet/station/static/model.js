@@ -20,6 +20,7 @@ export class Fleet extends EventTarget {
   walls = new Set();   // blocked cells that belong to the map
   blocked = new Set();
   pending = new Set();
+  blocks = new Map();  // cell -> {cell, user, robot, reason, since, until} of cells that people or sensors blocked
   engine = null;
   masters = null;      // which of several leads; null: there is one
   selected = null;
@@ -59,6 +60,7 @@ export class Fleet extends EventTarget {
     for (const [text, tone] of this.#robotNews(message.robots)) this.#tell(text, tone);
     this.blocked = new Set(message.blocked);
     this.pending = new Set(message.pending);
+    this.blocks = new Map((message.blocks ?? []).map((block) => [block.cell, block]));
     const present = new Set();
     for (const state of message.robots) {
       present.add(state.id);
@@ -81,6 +83,8 @@ export class Fleet extends EventTarget {
     for (const cell of [...message.blocked, ...message.freed]) this.pending.delete(cell);
     for (const cell of message.blocked) this.blocked.add(cell);
     for (const cell of message.pending) this.pending.add(cell);
+    for (const cell of message.removed_blocks ?? []) this.blocks.delete(cell);
+    for (const block of message.blocks ?? []) this.blocks.set(block.cell, block);
     for (const state of message.robots) this.#take(state);
     for (const id of message.removed) this.#remove(id);
     if (message.blocked.length || message.pending.length || message.freed.length) this.dispatchEvent(new Event("cells"));

@@ -12,6 +12,7 @@ from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_fleet.station import fleet_link
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.planner_client import PlannerUnavailableError
 from rce_fleet.station.ros_planner_client import RosPlannerClient
@@ -117,7 +118,7 @@ class Station:
         async with asyncio.timeout(WAIT_S):
             while True:
                 try:
-                    await self.link.block_cell(cell, blocked=True)
+                    await self.link.block_cell(DesiredCell(cell, True))
                 except PlannerUnavailableError:
                     await asyncio.sleep(0.1)
                 else:

@@ -32,6 +32,7 @@ async def state_of(fleet: ManagedFleet) -> dict[str, Any]:
         "goals": {robot.id: robot.goal for robot in state.robots},
         "zones": {zone.id for zone in state.zones},
         "blocked": set(state.blocked),
+        "blocks": {(block.cell, block.by, block.reason, block.lifetime > 0) for block in state.blocks},
     }
 
 
@@ -47,7 +48,8 @@ async def test_modes_and_zones_survive_the_planner(tmp_path: Path) -> None:
         async with asyncio.timeout(LONGEST_S):
             while (await fleet.ask("PUT", "/robots/Robot2/goal", {"cell": 47})).status != 200:
                 await asyncio.sleep(0.2)
-        blocked = await fleet.call("/fleet/block_cell", "fleet/BlockCell", cell=40, blocked=True)
+        hole = {"cell": 40, "blocked": True, "reason": "hole", "by": "eve", "lifetime": 3600.0}
+        blocked = await fleet.call("/fleet/block_cell", "fleet/BlockCell", **hole)
         assert blocked is not None
         assert blocked.ok
 
@@ -57,6 +59,7 @@ async def test_modes_and_zones_survive_the_planner(tmp_path: Path) -> None:
                 bool(state["robots"].get("Robot1") == "paused")
                 and bool(state["zones"] == {"spill", "ice"})
                 and {26, 27, 40} <= state["blocked"]
+                and bool(state["blocks"] == {(40, "eve", "hole", True)})
                 and bool(state["goals"].get("Robot2") == 47)
             )
 

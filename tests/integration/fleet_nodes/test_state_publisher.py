@@ -6,6 +6,8 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
@@ -68,11 +70,19 @@ async def outside() -> AsyncIterator[Outside]:
 async def test_changes_name_what_changed_and_nothing_else() -> None:
     async with outside() as made:
         assert [len(change.robots) for change in made.changes] == [ROBOTS]
-        made.planner.handle(CellBlocked(399), 0.1)
+        made.planner.handle(CellBlocked(399, by="ann", reason="spill", expires=60.1), 0.1)
         made.tick()
         await made.heard()
         change = made.changes[-1]
         assert (list(change.blocked), list(change.robots), change.sequence) == ([399], [], 2)
+        (block,) = change.blocks
+        assert (block.cell, block.sensed, block.by, block.reason) == (399, False, "ann", "spill")
+        assert (block.age, block.lifetime) == (pytest.approx(0.1), pytest.approx(59.9))
+        made.planner.handle(CellFreed(399), 0.2)
+        made.tick()
+        await made.heard()
+        change = made.changes[-1]
+        assert (list(change.freed), list(change.removed_blocks), change.blocks) == ([399], [399], [])
 
 
 async def test_number_is_repeated_while_nothing_changes() -> None:

@@ -247,7 +247,13 @@ async def check_client(fleet: ManagedFleet) -> None:
             await client.task("T77777")
         with pytest.raises(ApiError, match="cell"):
             await client.create_task(TaskRequest(stops=[StopModel(cell=10_000)]))
-        await client.set_blocked(62, blocked=True)
+        until = time.time() + 3600
+        await client.set_blocked(62, blocked=True, reason="spill", until=until)
+        (block,) = (await client.map()).blocks
+        assert (block.cell, block.reason, block.until, block.robot) == (62, "spill", until, "")
+        async with asyncio.timeout(60):
+            while [(one.cell, one.reason) for one in (await client.fleet()).blocks] != [(62, "spill")]:
+                await asyncio.sleep(0.05)  # the planner's state comes a little later
         await client.set_blocked(62, blocked=False)
         assert await client.robot("Robot1") in await client.robots()
         changed_robot = await client.change_robot("Robot1", ProfileModel(payload=20))

@@ -111,7 +111,7 @@ class Station:
         if request.can_read_body:
             self.bodies.append(await request.json())
         path = request.path.removeprefix("/api/v1/")
-        if path == "zones" and not self.has_manager:
+        if path.startswith("zones") and not self.has_manager:
             return web.json_response({"error": "the fleet manager did not answer"}, status=503)
         if request.method != "GET":
             self.changes.append(f"{request.method} {path}")
@@ -456,6 +456,19 @@ async def test_cells_are_freed_without_a_manager(station: Station, url: str) -> 
         "rce fleet: zones are left as they are, they cannot be read: the fleet manager did not answer",
         "cell 4 is free",
     ]
+
+
+async def test_a_cell_has_reason_and_end_without_a_manager(station: Station, url: str) -> None:
+    """A zone needs a manager; a cell for all robots does not."""
+    station.has_manager = False
+    began = time.time()
+    code, told = await run(url, "block", "4", "--reason", "oil", "--for", "60")
+    assert (code, told.split(" until ")[0], station.changes) == (0, "cell 4 is blocked", ["PUT cells/4"])
+    asked = station.bodies[-1]
+    assert 60 <= asked.pop("until") - began < 120
+    assert asked == {"blocked": True, "reason": "oil"}
+    code, told = await run(url, "block", "4>5", "--reason", "oil")
+    assert (code, told) == (1, "rce fleet: the fleet manager did not answer\n")
 
 
 async def test_free_of_what_was_not_blocked_fails(station: Station, url: str) -> None:

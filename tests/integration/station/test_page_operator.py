@@ -16,6 +16,7 @@ from aiohttp.test_utils import TestServer
 from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
 from unit.station.test_station_view import changes, pose, robot, state
 
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.planner_client import PlannerUnavailableError
@@ -56,8 +57,9 @@ class Planner(FleetLink):
     async def request(self, request: dict[str, Any]) -> dict[str, Any]:
         raise PlannerUnavailableError("no manager")
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        change = changes(blocked=[cell]) if blocked else changes(freed=[cell])
+    async def block_cell(self, wanted: DesiredCell) -> str:
+        cell = wanted.cell
+        change = changes(blocked=[cell]) if wanted.blocked else changes(freed=[cell])
         self.feed.on_change(self.view.on_changes(change))
         return f"cell {cell}"
 

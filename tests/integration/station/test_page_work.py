@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from integration.station.test_page_operator import Planner, Site, site
 from support.fleet_manager import ManagerClient
-from unit.station.test_station_view import changes, robot
+from unit.station.test_station_view import block, changes, robot
 
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.task import StopVisit, TaskState
@@ -360,7 +361,7 @@ async def test_a_robot_that_is_driven_by_its_poses_is_marked(tmp_path: Path) -> 
 
 async def test_the_cursor_tells_what_is_in_its_cell(tmp_path: Path) -> None:
     """In a live text; Enter on a robot's row moves the map to the robot."""
-    async with managed(tmp_path) as (_, client, page):
+    async with managed(tmp_path) as (made, client, page):
         zone = {"kind": "slow", "value": 0.2, "cells": [1, 9]}
         await client.ask("PUT", "/zones/aisle", zone)
         await page.wait_for_function("rceFleet.work.zones.length === 1")
@@ -369,6 +370,26 @@ async def test_the_cursor_tells_what_is_in_its_cell(tmp_path: Path) -> None:
             await page.keyboard.press(key)
         text = await page.locator("#cursor-text[aria-live=polite]").inner_text()
         assert text == "cell 9, row 1, column 1, Robot1, idle, zone aisle"
+        told = [
+            block(17, "ann", reason="spill", lifetime=600.0),
+            block(18, "bob"),
+            block(26, "Robot3", sensed=True),
+        ]
+        change = changes(blocked=[17, 18, 25], pending=[26], blocks=told)
+        made.feed.on_change(made.view.on_changes(change, time.time()))
+        await page.wait_for_function("rceFleet.fleet.blocks.size === 3")
+        for key, pattern in (
+            ("ArrowUp", r"cell 17, row 2, column 1, blocked by ann: spill, until (.+, )?\d\d:\d\d"),
+            ("ArrowRight", r"cell 18, row 2, column 2, blocked by bob, since (.+, )?\d\d:\d\d"),
+            ("ArrowUp", r"cell 26, .* will be .*, blocked: Robot3 saw something, (.+, )?\d\d:\d\d"),
+            ("ArrowLeft", "cell 25, row 3, column 1, blocked"),
+        ):
+            await page.keyboard.press(key)
+            text = await page.locator("#cursor-text").inner_text()
+            assert re.fullmatch(pattern, text), text
+        x, y = await page.evaluate("rceFleet.view.screenOf(17)")
+        await page.locator("#map").hover(position={"x": x, "y": y})
+        await page.wait_for_function("document.querySelector('#map').title.includes('by ann: spill')")
         await page.evaluate("rceFleet.view.camera.zoom(4)")
         await page.locator("tr[data-robot=Robot2]").focus()
         await page.keyboard.press("Enter")

@@ -9,6 +9,7 @@ from support.fuzzing import Tracebacks, exchange, requests
 
 from rce.web.server import HttpServer
 from rce_fleet.station.authentication import TokenAuthenticator
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
@@ -46,8 +47,8 @@ class Planner(FleetLink):
     async def request(self, request: dict[str, Any]) -> dict[str, Any]:
         return {"status": 200, "body": EVENTS, "revision": '"1"'}
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        return f"{cell} {blocked}"
+    async def block_cell(self, wanted: DesiredCell) -> str:
+        return f"{wanted}"
 
 
 @pytest.mark.parametrize("login", [*LOGINS, [*LOGINS[0], *UPGRADE]])

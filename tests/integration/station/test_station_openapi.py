@@ -13,6 +13,7 @@ from support.master_program import master
 
 from rce.web.server import HttpServer
 from rce_fleet.station.authentication import AuthenticationError
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
@@ -64,7 +65,7 @@ class Planner(FleetLink):
     async def set_goal(self, robot: str, cell: int | None) -> str:
         return self._answer()
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+    async def block_cell(self, wanted: DesiredCell) -> str:
         return self._answer()
 
     async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from yarl import URL
 
 from rce.web.bodies import read_whole
 from rce_fleet.station import access, engine_authenticator, page_socket
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
@@ -41,8 +42,8 @@ class RecordingFleet:
         self.desired.append((robot, cell))
         return "done"
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        self.desired.append((cell, blocked))
+    async def block_cell(self, wanted: DesiredCell) -> str:
+        self.desired.append((wanted.cell, wanted.blocked))
         return "done"
 
     async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from aiohttp import ClientSession, CookieJar, web
 from aiohttp.test_utils import TestClient, TestServer
 
 from rce_fleet.station.authentication import TokenAuthenticator
+from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.planner_client import PlannerError, PlannerUnavailableError
@@ -32,8 +33,8 @@ class RecordingFleet(FleetLink):
     async def set_goal(self, robot: str, cell: int | None) -> str:
         return self._note("goal", robot, cell)
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        return self._note("cell", cell, blocked)
+    async def block_cell(self, wanted: DesiredCell) -> str:
+        return self._note("cell", wanted.cell, wanted.blocked, *filter(None, (wanted.reason, wanted.until)))
 
     async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
         answer = self._note("preview" if preview else "grid", *choice.values())
@@ -95,10 +96,13 @@ STATE = {
 
 async def test_reads_the_fleet(running: RunningStation) -> None:
     await running.start()
-    running.view.on_state(STATE)
+    spill = {"cell": 1, "sensed": False, "by": "ann", "reason": "spill", "age": 10.0, "lifetime": 60.0}
+    running.view.on_state({**STATE, "blocks": [spill]}, 1000.0)
     fleet = await (await running.client.get("/api/v1/fleet")).json()
     assert fleet["map"]["rows"] == 2
     assert (fleet["blocked"], fleet["pending"]) == ([3], [1])
+    told = {"cell": 1, "user": "ann", "robot": "", "reason": "spill", "since": 990.0, "until": 1060.0}
+    assert fleet["blocks"] == [told]
     robot = await (await running.client.get("/api/v1/robots/Robot1")).json()
     assert (robot["goal"], robot["plan"], robot["pose"]) == (2, [0, 2], None)
     assert (fleet["age"], robot["age"]) == (None, None)
@@ -168,6 +172,12 @@ async def test_sets_goals_and_blocks_cells(running: RunningStation) -> None:
     assert (await running.client.put("/api/v1/robots/Robot1/goal", json={"cell": None})).status == 200
     assert (await running.client.put("/api/v1/cells/7", json={"blocked": True})).status == 200
     assert running.fleet.desired == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
+    until = round(time.time()) + 600
+    spill = {"blocked": True, "reason": "spill", "until": until}
+    assert (await running.client.put("/api/v1/cells/7", json=spill)).status == 200
+    assert running.fleet.desired[-1] == ("cell", 7, True, "spill", until)
+    reply = await running.client.put("/api/v1/cells/7", json={"blocked": True, "until": 1.0})
+    assert (reply.status, "the end 1 is not after now" in (await reply.json())["error"]) == (409, True)
 
 
 async def test_previews_and_changes_the_grid(running: RunningStation) -> None:

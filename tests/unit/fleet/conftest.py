@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rce_fleet.coordination.cell_blocks import CellBlock
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellsIgnored,
@@ -153,6 +154,7 @@ class SimulatedClients:
         self.plan_delays = plan_delays
         self.told: dict[str, RobotSnapshot] = {}
         self.told_cells: dict[int, str] = {}
+        self.told_blocks: dict[int, CellBlock] = {}
         self.sequence = 0
         self.now = 1000.0
         self.set_forward = 1e9
@@ -209,6 +211,7 @@ class SimulatedClients:
         self._plans.clear()
         self.told.clear()
         self.told_cells.clear()
+        self.told_blocks.clear()
 
     def remove(self, robot: str) -> None:
         """Take a robot off the floor."""
@@ -346,11 +349,15 @@ class SimulatedClients:
                 del self.told[name]
             for state in ("blocked", "pending", "freed"):
                 self.told_cells.update(dict.fromkeys(getattr(changes, state), state))
+            self.told_blocks.update(changes.blocks)
+            for cell in changes.removed_blocks:
+                del self.told_blocks[cell]
         now = self.planner.snapshot()
         told = FleetSnapshot(
             robots=tuple(self.told[robot] for robot in sorted(self.told)),
             blocked=tuple(sorted(cell for cell, state in self.told_cells.items() if state == "blocked")),
             pending=tuple(sorted(cell for cell, state in self.told_cells.items() if state == "pending")),
+            blocks=tuple(sorted(self.told_blocks.items())),
         )
         assert without_poses(told) == without_poses(now)
 

@@ -36,6 +36,7 @@ def test_defaults_are_the_settings() -> None:
         ({"seed": True}, "parameter seed must be a number, not True"),
         ({"quarter_turn": -1}, "-1"),
         ({"improve_seconds": -1}, "parameter improve_seconds must be 0 or more, not -1"),
+        ({"sensed_lifetime": -1}, "parameter sensed_lifetime must be 0 or more, not -1"),
     ],
 )
 def test_settings_that_cannot_be_used_are_named(values: dict[str, Any], text: str) -> None:

@@ -18,7 +18,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import GoalEntry, Places, PlannerRun, RobotEntry, Zone
+from rce_fleet.tasks.records import CellBlock, GoalEntry, Places, PlannerRun, RobotEntry, Zone
 from rce_fleet.tasks.task import TaskState
 
 RUN = PlannerRun("1.0", "8 x 8")
@@ -40,8 +40,8 @@ class Planner:
             self.robots[robot].state = "idle" if cell is None else "driving"
         return self.refusal
 
-    async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        raise AssertionError(cell, blocked)
+    async def block_cell(self, cell: int, block: CellBlock | None, now: float) -> str:
+        raise AssertionError(cell, block, now)
 
     async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
         del reason, user

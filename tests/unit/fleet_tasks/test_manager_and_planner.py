@@ -21,7 +21,7 @@ from rce_fleet.nodes.state_publisher import state_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
-from rce_fleet.tasks.records import BlockedCells, FleetEntry, PlannerRun, Zone
+from rce_fleet.tasks.records import BlockedCells, CellBlock, FleetEntry, PlannerRun, Zone
 
 
 async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) -> None:
@@ -363,12 +363,12 @@ def test_goals_are_sent_again_after_a_restart() -> None:
 async def test_a_blocked_cell_is_in_the_journal_first(client: ManagerClient) -> None:
     """The planner is told what the journal has; a cell that only sensors blocked is freed as well."""
     kept: list[tuple[int, ...]] = []
-    planner, block = client.planner, client.planner.block_cell
+    planner, told = client.planner, client.planner.block_cell
 
-    async def block_cell(cell: int, *, blocked: bool) -> str:
+    async def block_cell(cell: int, block: CellBlock | None, now: float) -> str:
         records, _ = client.journal.load()
         kept.extend(record.unsent for record in records if isinstance(record, BlockedCells))
-        return await block(cell, blocked=blocked)
+        return await told(cell, block, now)
 
     planner.block_cell = block_cell  # type: ignore[method-assign]  # looks into the journal first
     status, said, _ = await client.ask("PUT", "/cells/12", {"blocked": True})
@@ -440,7 +440,8 @@ async def test_a_cell_that_the_planner_refuses_stays(client: ManagerClient) -> N
         assert (status, said, client.manager.book.blocked.cells) == (expected, {"error": refusal}, ())
     client.manager.facts.is_live = False
     assert (await client.ask("PUT", "/cells/12", {"blocked": True}))[0] == 200
-    assert client.manager.book.blocked == BlockedCells((12,), (12,))
+    kept = client.manager.book.blocked
+    assert (kept.cells, kept.unsent) == ((12,), (12,))
 
 
 async def test_a_zone_that_the_planner_refuses_is_not_made(client: ManagerClient) -> None:

@@ -27,29 +27,48 @@ def state(
 def test_complete_planner_state_needs_no_requests() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
-    desired.set_cell(7, blocked=True)
-    desired.set_cell(8, blocked=True)
+    desired.set_cell(DesiredCell(7, True))
+    desired.set_cell(DesiredCell(8, True))
     assert desired.unmet(state(("a", 5), blocked=(7,), pending=(8,))) == []
 
 
 def test_missing_cells_are_sent_before_goals() -> None:
     desired = Desired()
     desired.set_goal("a", 5)
-    desired.set_cell(7, blocked=True)
+    desired.set_cell(DesiredCell(7, True))
     assert desired.unmet(state(("a", -1), ("b", -1))) == [DesiredCell(7, True), DesiredGoal("a", 5)]
 
 
 def test_a_cell_that_was_freed_is_freed_again() -> None:
     desired = Desired()
-    desired.set_cell(7, blocked=True)
-    desired.set_cell(7, blocked=False)
+    desired.set_cell(DesiredCell(7, True))
+    desired.set_cell(DesiredCell(7, False))
     assert desired.unmet(state(blocked=(7,))) == [DesiredCell(7, False)]
     assert desired.unmet(state()) == []
 
 
+def test_a_cell_is_blocked_again_for_its_reason() -> None:
+    """With what is left of its time; one whose time has come is not blocked again."""
+    desired = Desired()
+    wanted = DesiredCell(7, True, "ann", "spill", since=1000.0, until=1060.0)
+    desired.set_cell(wanted)
+    assert desired.unmet(state(), 1020.0) == [wanted]
+    assert desired.holds(wanted)
+    assert wanted.request(1020.0) == {
+        "cell": 7,
+        "blocked": True,
+        "by": "ann",
+        "reason": "spill",
+        "age": 20.0,
+        "lifetime": 40.0,
+    }
+    assert desired.unmet(state(), 1060.0) == []
+    assert DesiredCell(7, True).request(5.0) == {"cell": 7, "blocked": True}, "an earlier planner knows it"
+
+
 def test_walls_are_not_sent() -> None:
     desired = Desired()
-    desired.set_cell(0, blocked=False)
+    desired.set_cell(DesiredCell(0, False))
     assert desired.unmet(state()) == []
 
 

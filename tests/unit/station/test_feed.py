@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from unit.station.test_station_view import changes, pose, robot, state
+from unit.station.test_station_view import block, changes, pose, robot, state
 
 from rce_fleet.station.feed import REPEAT_POSE_S, Feed
 from rce_fleet.station.live import Page
@@ -56,6 +56,20 @@ async def test_then_it_gets_what_changed(site: Site) -> None:
     assert [(robot["id"], robot["goal"]) for robot in change["robots"]] == [("Robot2", 7)]
     assert (change["freed"], change["blocked"], change["removed"]) == ([5], [], [])
     assert "pose" not in change["robots"][0]
+
+
+async def test_a_page_gets_who_blocked_cells(site: Site) -> None:
+    """At first all, then those that changed."""
+    await site.take()
+    told = block(5, "ann", reason="spill")
+    site.feed.on_change(site.view.on_changes(changes(blocks=[told]), 1000.0))
+    (change,) = await site.take()
+    ann = {"cell": 5, "user": "ann", "robot": "", "reason": "spill", "since": 990.0, "until": None}
+    assert (change["blocks"], change["removed_blocks"], change["blocked"]) == ([ann], [], [])
+    _, known, _ = await site.take(site.feed.pages.open())
+    assert known["blocks"] == [ann]
+    site.feed.on_change(site.view.on_changes(changes(removed_blocks=[5]), 1001.0))
+    assert [change["removed_blocks"] for change in await site.take()] == [[5]]
 
 
 async def test_numbers_of_a_late_page_go_on_from_its_state(site: Site) -> None:

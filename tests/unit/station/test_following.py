@@ -59,6 +59,12 @@ def test_changes_are_taken_one_by_one(follower: ChangeFollower) -> None:
     assert not follower.is_behind
 
 
+@pytest.mark.parametrize("part", ["zones", "removed_zones", "blocks", "removed_blocks"])
+def test_a_change_may_have_one_part_only(follower: ChangeFollower, part: str) -> None:
+    assert follower.take_changes({**repeated(6), part: [1]})
+    assert not follower.is_behind
+
+
 def test_a_number_that_is_left_out_is_noticed(follower: ChangeFollower) -> None:
     assert not follower.take_changes(change(7))
     assert follower.is_behind

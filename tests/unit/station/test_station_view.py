@@ -94,6 +94,29 @@ def test_a_change_that_is_applied_again_does_no_harm() -> None:
     assert view.state == known
 
 
+def block(cell: int, by: str, **more: object) -> dict[str, Any]:
+    return {"cell": cell, "sensed": False, "by": by, "reason": "", "age": 10.0, "lifetime": 0.0, **more}
+
+
+def test_who_blocked_cells_is_followed() -> None:
+    """Times are of this machine; those that differ by the way of the message are the same."""
+    view = FleetView()
+    cells = {"blocked": [1, 2, 3]}
+    spill = block(1, "ann", reason="spill", lifetime=50.0)
+    change = view.on_state(state(**cells, blocks=[spill, block(2, "Robot3", sensed=True)]), 1000.0)
+    assert (change.blocks, change.removed_blocks) == ((1, 2), ())
+    ann = {"cell": 1, "user": "ann", "robot": "", "reason": "spill", "since": 990.0, "until": 1050.0}
+    saw = {"cell": 2, "user": "", "robot": "Robot3", "reason": "", "since": 990.0, "until": None}
+    assert view.blocks() == [ann, saw]
+    assert view.on_changes(changes(blocks=[block(3, "bob")], removed_blocks=[2]), 1001.0) == ViewChange(
+        blocks=(3,), removed_blocks=(2,)
+    )
+    assert [known["cell"] for known in view.blocks()] == [1, 3]
+    change = view.on_state(state(**cells, blocks=[{**spill, "age": 11.4, "lifetime": 49.2}]), 1001.0)
+    assert (change.blocks, change.removed_blocks, view.blocks()) == ((), (3,), [ann])
+    assert view.on_state(state(**cells)).removed_blocks == (1,), "a planner of an earlier release"
+
+
 def test_pose_of_an_absent_robot_is_dropped() -> None:
     view = FleetView()
     view.on_state(state(robot("Robot1"), robot("Robot2")))
