@@ -3,8 +3,8 @@
 It needs no engine. ``tick``: robots drive on warehouse-10-20-10-2-1, each with a pose and a report in every
 tick of 0.1 s. A tick is all of it: serialized poses in, reports in, grants and changes of the state out.
 Ticks that take over a part of a plan are ticks too. ``block``: a cell on many robots' paths is blocked; the
-time of the planner's work and of the plan until the last of them has its new path, without the waits for the
-tick (0.1 s at most) and for the process that makes plans.
+time of the planner's work and of the plan until the last of them has its new path, without the wait for the
+process that makes plans.
 ``memory``: what a robot adds to the planner.
 
 Times are those of the processor that the thread used, so that other load does not count. The map is that of
@@ -255,7 +255,7 @@ def measure(*, quick: bool, planner: str) -> None:
         ticks.append(tick_times(traffic, count, 100 if quick else 300))
         blocks += block_times(traffic, count, 5 if quick else 20)
     show(f"Tick of the planner node, planner {planner}", ticks)
-    show("From a blocked cell to the last new path, without waits for tick and process", blocks)
+    show("From a blocked cell to the last new path, without the wait for the process", blocks)
     results.begin("memory")
     sizes_of = [memory(count, planner) for count in sizes[:2]]
     show("Memory of the planner", sizes_of)

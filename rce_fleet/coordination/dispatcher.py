@@ -35,6 +35,7 @@ class Dispatcher:
         now: Time of the current event, seconds.
         out: Its instructions so far.
         is_tick: Whether the current event is a tick.
+        at_once: Whether robots that it concerns get new paths before the next tick.
         left: Pending cells that may be free of robots now.
         expected: Robots that no cells are granted before, until they have sent a pose, and until when.
 
@@ -49,6 +50,7 @@ class Dispatcher:
         self.now = 0.0
         self.out: list[Instruction] = []
         self.is_tick = False
+        self.at_once = False
         self.left: set[int] = set()
         self.expected: dict[str, float] = {}
         self._placement = Placement(state, settings, self)
@@ -71,7 +73,7 @@ class Dispatcher:
         self.state.refresh()
         if self._expects():
             return
-        request = self._paths.supply(self.now, is_tick=self.is_tick)
+        request = self._paths.supply(self.now, is_tick=self.is_tick, at_once=self.at_once)
         if request is not None:
             self.out.append(request)
         elif self._paths.is_quiet:

@@ -4,7 +4,7 @@ Like new paths for some robots (see :mod:`rce_fleet.coordination.rerouting`) the
 ledger, among the visits of all, and entered between these. Granted cells stay as they are. The result is used
 only if all that the copy holds is still true: then it is one order of steps, in which no robots wait for each
 other in a circle. Nothing is granted while the process searches, which is for a twentieth of a second. A late
-answer is ignored.
+answer is ignored, and so is one that a blocked cell, or a robot that fell out, made useless.
 """
 
 from __future__ import annotations
@@ -83,15 +83,15 @@ class Improving:
         Returns:
             Robots that need new paths: zones do not allow all of theirs.
         """
-        holds = self._holds(request, found)
+        holds = self.holds(request) and self._has_goals(request, found)
         # After a gain there may be more to gain; what was found for another state is looked for again.
         self.is_due = bool(found.robots) or not holds
         if not found.robots or not holds:
             return set()
         return adopt_rerouting(self._state, request, found, self._versions)
 
-    def _holds(self, request: PlanRequest, found: Rerouting) -> bool:
-        """Return whether cells, paths, and goals of robots with better paths are still those of the copy."""
+    def holds(self, request: PlanRequest) -> bool:
+        """Return whether cells and paths are still those of the request's copy."""
         state = self._state
         if state.map_version != self._map_version:
             return False
@@ -103,11 +103,13 @@ class Improving:
                 return False
             if state.ledger.end_of_grant(robot) != start:
                 return False
-        for index in found.robots:
-            if state.robots[request.robots[index]].goal != request.goals[index]:
-                return False
         known, blocked = frozenset(request.robots), frozenset(request.blocked)
         return all(robot in known or state.ledger.claims(robot) <= blocked for robot in state.robots)
+
+    def _has_goals(self, request: PlanRequest, found: Rerouting) -> bool:
+        """Return whether the goals of robots with better paths are still those of the request."""
+        robots = self._state.robots
+        return all(robots[request.robots[index]].goal == request.goals[index] for index in found.robots)
 
 
 def compute_improvement(request: PlanRequest) -> Rerouting:

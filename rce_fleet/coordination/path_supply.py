@@ -5,12 +5,13 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.adoption import PlanAdoption
 from rce_fleet.coordination.congestion import LearnedCosts
 from rce_fleet.coordination.events import Instruction, MakePlan
 from rce_fleet.coordination.improving import Improving
 from rce_fleet.coordination.own_planner import OwnPlanner
 from rce_fleet.coordination.repair import PathRepair
-from rce_fleet.coordination.replanning import PlanAdoption, PlanRequest, PlanResult, request_plan
+from rce_fleet.coordination.replanning import PlanRequest, PlanResult, request_plan
 from rce_fleet.coordination.rerouting import adopt_rerouting
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.starvation import StarvationGuard
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 _LOOK_EVERY = 1.0
 """Seconds between two searches for robots that wait for each other."""
+_BETWEEN = 0.1
+"""Seconds between two searches before the next tick: what is blocked in one go is looked at together."""
 _REPAIR_CELLS = 100_000
 """So many cells are searched for repairs in one tick, in about 40 ms; larger maps are for the process."""
 _ALONE_CELLS = 50_000
@@ -62,6 +65,11 @@ class PathSupply:
         self._own = OwnPlanner(settings.planner)
         state.ledger.ordered = not self._is_alone
         self._looked_at = -inf
+        self._is_due = False
+        """Whether the robots concerned get paths before the next tick."""
+        self._searched_at = -inf
+        self._took_over = False
+        """Whether paths were taken over with this event: their cells are granted before others are sought."""
         self._waits_since: float | None = None
         self._deadlocked: set[str] = set()
         self._users: dict[str, set[str]] = {}
@@ -84,13 +92,18 @@ class PathSupply:
         return self._adoption is not None
 
     def require(self, robots: Iterable[str]) -> None:
-        """Note that robots need new paths, and that the state changed since the newest plan request."""
-        can_repair = self._state.ledger.ordered and self._settings.repairs
-        is_for_all = self._asked is not None and self._asked.copy is None
-        if not is_for_all and (can_repair or self._is_alone):
+        """Note that robots need new paths, and that the state changed since the newest plan request.
+
+        While a plan for all is made, the others take it over as it is.
+        """
+        if self._can_repair():
             self.concerned.update(robots)
         else:
             self.outdated = True
+
+    def _can_repair(self) -> bool:
+        """Return whether single robots get new paths; otherwise one plan is always made for all."""
+        return self._is_alone or (self._state.ledger.ordered and self._settings.repairs > 0)
 
     def take_plan(self, result: PlanResult, now: float) -> None:
         """Begin to take over the requested plan; ignore any other."""
@@ -98,7 +111,7 @@ class PathSupply:
         if request is None or request.number != result.number or self._adoption is not None:
             return
         if result.rerouting is not None:
-            self._asked = None
+            self._asked, self._took_over = None, True
             if request.improve_seconds:
                 self.concerned |= self._improving.take(request, result.rerouting)
             elif result.rerouting.found:
@@ -129,47 +142,68 @@ class PathSupply:
         adoption = self._adoption
         if adoption is None or not adoption.step(self._settings.visits_per_step):
             return False
-        self.outdated |= adoption.was_cut
-        self._improving.is_due = True
+        self._improving.is_due = self._took_over = True
         self._asked = self._adoption = None
+        left, self.concerned = adoption.robots_left(self.concerned), set()
+        if left:
+            self.require(left)
         return self.outdated and not self._awaited(now)
 
-    def supply(self, now: float, *, is_tick: bool) -> Instruction | None:
+    def supply(self, now: float, *, is_tick: bool, at_once: bool = False) -> Instruction | None:
         """Find new paths for robots that need some, or return the request of a plan for all.
 
         Args:
             now: Time, seconds.
             is_tick: Whether the current event is a tick; single paths are found then.
+            at_once: Whether they are found before the next tick, unless some were found just now.
         """
-        if self._awaits_answer(now):
+        took_over, self._took_over = self._took_over, False
+        self._is_due = bool(self.concerned) and (self._is_due or at_once or took_over)
+        if self._awaits_answer(now, looks=is_tick or at_once):
             return None
         if self._partial and not self._state.index.under_way:
             self.outdated = True
         if is_tick:
-            if self._learned is not None:
-                self._learned.look(now)
-            self._look_for_deadlocks(now)
-            self._look_for_room()
-            need = self._guard.look(now)
-            if need.paths:
-                self.require(need.paths)
-            self.outdated |= need.plan or (bool(self.concerned) and self._own.is_asked(now))
-        if self.concerned and is_tick and not self.outdated:
-            request = self._replan_concerned(now)
-            self._improving.is_due = True
-            self._state.refresh()
-            if request is not None:
-                return request
+            self._look_at_waiting(now)
+        is_due = is_tick or (self._is_due and now - self._searched_at >= _BETWEEN)
+        if self.concerned and is_due and not took_over:
+            self._is_due, self._searched_at = False, now
+            self.outdated |= self._own.is_asked(now) or not self._can_repair()
+            if not self.outdated:
+                request = self._replan_concerned(now)
+                self._improving.is_due = True
+                self._state.refresh()
+                if request is not None:
+                    return request
         if self.outdated:
             return None if self._awaited(now) else self._ask(now)
         if is_tick and not self.concerned and self._improving.may_begin(now):
             return self._ask_for_better(now)
         return None
 
-    def _awaits_answer(self, now: float) -> bool:
-        """Return whether the process has a request; one for better paths is not waited for if it is late."""
-        if self._asked is not None and self._asked.improve_seconds and self._improving.give_up(now):
-            self._asked = None
+    def _look_at_waiting(self, now: float) -> None:
+        """Note what robots need that wait."""
+        if self._learned is not None:
+            self._learned.look(now)
+        self._look_for_deadlocks(now)
+        self._look_for_room()
+        need = self._guard.look(now)
+        if need.paths:
+            self.require(need.paths)
+        self.outdated |= need.plan
+
+    def _awaits_answer(self, now: float, *, looks: bool) -> bool:
+        """Return whether the process has a request; better paths that are late or useless are not waited for.
+
+        Args:
+            now: Time, seconds.
+            looks: Whether the robots' paths are compared with those that better ones are sought for.
+        """
+        asked = self._asked
+        if asked is not None and asked.improve_seconds:
+            needs_others = looks and (self.outdated or bool(self.concerned))
+            if self._improving.give_up(now) or (needs_others and not self._improving.holds(asked)):
+                self._asked = None
         return self._asked is not None
 
     def _ask_for_better(self, now: float) -> MakePlan:

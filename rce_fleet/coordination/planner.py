@@ -7,7 +7,8 @@ stopped no robot is granted anything new; then one plan is made for all from the
 
 Plans take long and are computed elsewhere: :class:`MakePlan` goes out, :class:`PlanMade` comes in, and
 nothing new is granted meanwhile. If the fleet has changed by then, the part of the plan that is still
-possible is used, so that robots make progress however often things change, and the next plan is requested.
+possible is used, so that robots make progress however often things change, and the robots whose part is not
+possible get other paths.
 
 The cost of an event depends on what it changes: records that depend on other robots are found by indexes.
 """
@@ -56,6 +57,9 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.snapshot import FleetSnapshot
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.planning.lanes import LaneGraph
+
+_AT_ONCE = frozenset({CellBlocked, ModeSet, ObstacleSeen, ZonesSet})
+"""Events after which the robots concerned get new paths before the next tick: their ways are cut."""
 
 
 class FleetPlanner:
@@ -111,7 +115,7 @@ class FleetPlanner:
         dispatcher = self._dispatcher
         self._now = dispatcher.now = now
         dispatcher.out = []
-        dispatcher.is_tick = False
+        dispatcher.is_tick, dispatcher.at_once = False, type(event) in _AT_ONCE
         reply = self._handlers[type(event)](event)
         if reply is not None:
             dispatcher.out.append(reply)

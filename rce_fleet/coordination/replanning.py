@@ -1,8 +1,9 @@
 """One plan for all active robots, from the cells that they are committed to.
 
 A plan is made in three steps, so that the long one can run in another process: :func:`request_plan` copies
-its input from the fleet's state, :func:`compute_plan` uses only this copy, and :class:`PlanAdoption` enters
-the result into the ledger, as far as the robots are still where the plan begins.
+its input from the fleet's state, :func:`compute_plan` uses only this copy, and
+:class:`~rce_fleet.coordination.adoption.PlanAdoption` enters the result into the ledger, as far as the robots
+are still where the plan begins.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.coordination.full_zones import note_unreachable
 from rce_fleet.coordination.improving import compute_improvement
 from rce_fleet.coordination.own_planner import find_fault
 from rce_fleet.coordination.rerouting import (
@@ -29,7 +29,6 @@ from rce_fleet.coordination.rerouting import (
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.starvation import urgency_of
 from rce_fleet.coordination.targets import assign_targets
-from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.planner import (
@@ -359,83 +358,3 @@ def _allowed(request: PlanRequest, visitors: Ints, cells: Ints) -> NDArray[np.bo
     before = np.where(is_first, ended - wrong, 0)
     kept[order] = ended == np.maximum.accumulate(before)
     return kept
-
-
-class PlanAdoption:
-    """Enters a plan's routes into the ledger, a part at a time.
-
-    The state may have changed since the request, and may change between two parts. A robot that is not active
-    any more, was granted other cells or has another goal gets no route, or no more of it, and a route ends
-    before a cell that the robot may not enter any more. That is safe, because robots drive only on granted
-    cells, and the ledger checks each grant; but robots may not reach their goals, so another plan has to
-    follow.
-
-    Attributes:
-        was_cut: Whether a route ended before a cell that is blocked, or that a zone does not allow any more.
-
-    Args:
-        state: The fleet; its ledger and the robots' ``unreachable`` and ``full_zone`` are changed.
-        request: The plan's request.
-        result: The plan.
-        zones: Revision of the zones that the plan keeps to.
-    """
-
-    def __init__(self, state: FleetState, request: PlanRequest, result: PlanResult, zones: int) -> None:
-        self._state = state
-        self._request = request
-        self._result = result
-        self._zones = zones
-        self._next = 0
-        self._present: list[str | None] = []
-        self.was_cut = False
-        unreachable, forbidden = frozenset(result.unreachable), dict(request.forbidden)
-        starts = {}
-        for index, robot in enumerate(request.robots):
-            is_present = self._wants(index) and state.ledger.end_of_grant(robot) == request.starts[index]
-            self._present.append(robot if is_present else None)
-            if not is_present:
-                continue
-            starts[robot] = request.starts[index]
-            barred = forbidden.get(index, ())
-            record, is_unreachable = state.robots[robot], index in unreachable
-            note_unreachable(state, record, is_unreachable=is_unreachable, barred=barred)
-        state.ledger.begin_plan(starts, ordered=result.ordered)
-        self._versions = [state.ledger.version(robot) for robot in request.robots]
-
-    def step(self, visits: int) -> bool:
-        """Enter the next ``visits`` visits; return whether these were the last ones."""
-        begin, end = self._next, self._next + visits
-        self._next = end
-        for index, robot in enumerate(self._present):
-            if robot is not None and not self._is_on_plan(index):
-                self._present[index] = None
-        self._state.ledger.extend_plan(self._visits(begin, end))
-        return end >= len(self._result.cells)
-
-    def _wants(self, index: int) -> bool:
-        """Return whether a robot still takes part, with the goal that was planned for."""
-        record = self._state.robots.get(self._request.robots[index])
-        if record is None or record.phase is not Phase.ACTIVE:
-            return False
-        return (NO_CELL if record.goal is None else record.goal) == self._request.goals[index]
-
-    def _is_on_plan(self, index: int) -> bool:
-        robot = self._request.robots[index]
-        return self._wants(index) and self._state.ledger.version(robot) == self._versions[index]
-
-    def _visits(self, begin: int, end: int) -> Iterator[tuple[str, int, int]]:
-        """Yield visits in order, as far as they are still possible."""
-        state, present, result = self._state, self._present, self._result
-        shut, ledger = state.shut, state.ledger
-        rules = ZoneRules(state) if state.zones.revision != self._zones else None
-        steps = result.steps or range(1, len(result.cells) + 1)
-        parts = (result.visitors[begin:end], result.cells[begin:end], steps[begin:end])
-        for index, cell, step in zip(*parts, strict=True):
-            robot = present[index]
-            if robot is None:
-                continue
-            if cell in shut or (rules and not rules.admit(robot, ledger.account(robot).route[-1], cell)):
-                present[index] = None  # Its route ends here.
-                self.was_cut = True
-            else:
-                yield robot, cell, step

@@ -86,14 +86,14 @@ def test_robot_on_anothers_goal_moves_away_and_stays_away(make: Make) -> None:
 
 
 def test_a_cell_blocked_beyond_the_base_stops_no_robot(make: Make) -> None:
-    """The robot drives on in its granted cells, and has another path with the next tick."""
+    """The robot drives on in its granted cells, and has another path before the next tick."""
     fleet = make(GridMap(), [24], [31])
     cell, base = robot(fleet).plan[5], robot(fleet).granted
+    fleet.now += 0.2
     out = fleet.tell(CellBlocked(cell))
     assert SendCancel("Robot1") not in out
     assert BlockedChanged((cell,)) in out
     fleet.blocked = {cell}
-    fleet.tell(Tick())
     assert robot(fleet).plan[: len(base)] == base
     assert robot(fleet).plan[-1] == 31
     assert cell not in robot(fleet).plan
