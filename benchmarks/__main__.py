@@ -43,7 +43,15 @@ OTHERS = {
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
     "fleet": (
-        *(("light",), ("fleet",), ("traffic",), ("assignment",), ("batches",), ("planning",)),
+        *(
+            ("light",),
+            ("fleet",),
+            ("traffic",),
+            ("throughput",),
+            ("assignment",),
+            ("batches",),
+            ("planning",),
+        ),
         ("station",),
     ),
     "day": (("day",),),

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import exploration, figures, mapping, traffic
+from benchmarks import exploration, figures, mapping, throughput, traffic
 from benchmarks.figures import Results
 from benchmarks.page import block, made
 from benchmarks.roundtrip import _row
@@ -129,6 +129,23 @@ def test_traffic_of_another_planner_is_not_saved(
     monkeypatch.setattr(sys, "argv", ["traffic", *options])
     traffic.main()
     assert (folder / "traffic.json").exists() == saved
+
+
+@pytest.mark.parametrize(("options", "robots"), [([], 100), (["--robots", "9"], None)])
+def test_goals_of_dijkstra_stand_beside_those_of_lacam(
+    options: list[str], robots: int | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(throughput, "compile_kernels", lambda: True)
+    monkeypatch.setattr(throughput, "measure", lambda *_: 7)
+    monkeypatch.setattr(sys, "argv", ["throughput", *options])
+    throughput.main()
+    results = json.loads((folder / "throughput.json").read_text(encoding="utf-8"))
+    table = block("throughput.goals", merged({}, "throughput", results))
+    if robots is None:
+        assert table == "Not measured yet: `python -m benchmarks.throughput`.\n"
+    else:
+        assert f"| lacam | paths as planned | {robots} | [7, 7, 7] | 84 |" in table
+        assert f"| dijkstra | shortest paths | {robots} | [7, 7, 7] | 84 |" in table
 
 
 @pytest.mark.parametrize(
