@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.replanning import PlanRequest, PlanResult
 
+NO_WAY_PAST = "no way past the other robots was found yet: the planner looks again, longer each time"
+"""Why a robot has no path after a plan for all that is not complete ..."""
+NO_PLAN_EXISTS = "the robots cannot pass each other: no plan brings all to their goals; send one elsewhere"
+"""... and if everything was tried."""
+
 
 class PlanAdoption:
     """Enters a plan's routes into the ledger, a part at a time.
@@ -31,7 +36,7 @@ class PlanAdoption:
         result: The plan.
 
     Args:
-        state: The fleet; its ledger and the robots' ``unreachable`` and ``full_zone`` are changed.
+        state: The fleet; its ledger and the robots' ``unreachable``, ``full_zone`` and ``no_path`` change.
         request: The plan's request.
         result: The plan.
         zones: Revision of the zones that the plan keeps to.
@@ -66,7 +71,10 @@ class PlanAdoption:
             if robot is not None and not self._is_on_plan(index):
                 self._present[index] = None
         self._state.ledger.extend_plan(self._visits(begin, end))
-        return end >= len(self.result.cells)
+        is_done = end >= len(self.result.cells)
+        if is_done:
+            self._explain()
+        return is_done
 
     def robots_left(self, concerned: Iterable[str]) -> set[str]:
         """Return the robots that need another path after the last step.
@@ -98,6 +106,22 @@ class PlanAdoption:
         goal = self._state.robots[robot].goal
         is_open = goal is not None and not self._state.is_shut(goal)
         return is_open and self._state.ledger.route(robot)[-1:] == [goal]
+
+    def _explain(self) -> None:
+        """Note why robots have no path to their goals, if the plan has none although they can be reached."""
+        result = self.result
+        why = ""
+        if result.failure:
+            why = f"the planner made no plan: {result.failure}"
+        elif not result.complete:
+            why = NO_PLAN_EXISTS if result.impossible else NO_WAY_PAST
+        for robot in filter(None, self._present):
+            record = self._state.robots[robot]
+            needs_none = record.goal is None or record.unreachable
+            no_path = "" if needs_none or self._has_path(robot) else why
+            if record.no_path != no_path:
+                record.no_path = no_path
+                self._state.touch(record)
 
     def _wants(self, index: int) -> bool:
         """Return whether a robot still takes part, with the goal that was planned for."""

@@ -257,11 +257,10 @@ class FleetState:
     def _describe(self, record: RobotRecord) -> RobotSnapshot:
         route = self.ledger.route(record.id)
         state = self._state_of(record, route)
-        waits_for_room = state is RobotState.WAITING and record.full_zone
         return RobotSnapshot(
             id=record.id,
             state=state,
-            reason=record.reason or (f"zone {record.full_zone!r} is full" if waits_for_room else ""),
+            reason=record.reason or (_why_waits(record, route) if state is RobotState.WAITING else ""),
             x=record.x,
             y=record.y,
             yaw=record.yaw,
@@ -295,6 +294,13 @@ class FleetState:
         if record.unreachable:
             return RobotState.WAITING if record.full_zone else RobotState.UNREACHABLE
         return _AT_REST[record.goal is not None, route == [record.goal]]
+
+
+def _why_waits(record: RobotRecord, route: list[int]) -> str:
+    """Return why a robot waits, if it is not for others to leave its path, for people."""
+    if record.full_zone:
+        return f"zone {record.full_zone!r} is full"
+    return record.no_path if len(route) == 1 else ""
 
 
 _AT_REST = {

@@ -14,6 +14,7 @@ from rce_fleet.coordination.repair import PathRepair
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, request_plan
 from rce_fleet.coordination.rerouting import adopt_rerouting
 from rce_fleet.coordination.robot import Phase
+from rce_fleet.coordination.search_time import SearchTime
 from rce_fleet.coordination.starvation import StarvationGuard
 from rce_fleet.coordination.waiting import find_deadlocks
 from rce_fleet.coordination.zones import ZoneKind
@@ -60,6 +61,7 @@ class PathSupply:
         self._repair = PathRepair(state, settings)
         self._guard = StarvationGuard(state, settings)
         self._improving = Improving(state, settings)
+        self._search_time = SearchTime(settings.plan_timeout)
         self._learned = LearnedCosts(state) if settings.learn_congestion else None
         self._is_alone = settings.planner == INDEPENDENT
         self._own = OwnPlanner(settings.planner)
@@ -142,6 +144,7 @@ class PathSupply:
         adoption = self._adoption
         if adoption is None or not adoption.step(self._settings.visits_per_step):
             return False
+        self._search_time.note(adoption.request, adoption.result)
         self._improving.is_due = self._took_over = True
         self._asked = self._adoption = None
         left, self.concerned = adoption.robots_left(self.concerned), set()
@@ -217,7 +220,14 @@ class PathSupply:
         self.concerned.clear()
         self._guard.note_request()
         planner = self._own.name_at(now)
-        self._asked = request_plan(self._state, self._settings, self._plans, now, planner=planner)
+        self._asked = request_plan(
+            self._state,
+            self._settings,
+            self._plans,
+            now,
+            planner=planner,
+            search_seconds=self._search_time.take(now),
+        )
         self._asked_at = now
         self._zones = self._state.zones.revision
         self._plans += 1

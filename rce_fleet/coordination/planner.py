@@ -286,6 +286,7 @@ class FleetPlanner:
                 return Reply(False, refusal)
         if record.goal != event.cell:
             record.goal, record.rest, record.goal_at = event.cell, None, self._now
+            record.no_path = ""
             self.state.touch(record)
             self._dispatcher.require([record.id])
             self._drop_path(record)

@@ -79,6 +79,8 @@ class PlanRequest:
         copy: Where only some robots need new paths: the paths of all; None: one plan is made for all.
         improve_seconds: Time in which better paths are looked for among those of the copy, none of which has
             to change; 0: the copy's members need new paths.
+        search_seconds: Time in which the search for a plan for all is repeated if it does not bring all
+            robots to their targets, see :mod:`rce_fleet.coordination.search_time`.
     """
 
     number: int
@@ -104,6 +106,7 @@ class PlanRequest:
     urgency: tuple[int, ...] = ()
     copy: LedgerCopy | None = None
     improve_seconds: float = 0.0
+    search_seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +124,7 @@ class PlanResult:
         rerouting: The new paths, where only some robots get new or better ones; then there are no visits.
         failure: Why a plan is missing: the planner's error, or what is wrong with its plan; then there are no
             visits.
+        impossible: Whether it is known that no plan brings all robots to their targets.
     """
 
     number: int
@@ -132,6 +136,7 @@ class PlanResult:
     ordered: bool = True
     rerouting: Rerouting | None = None
     failure: str = ""
+    impossible: bool = False
 
 
 def request_plan(
@@ -143,6 +148,7 @@ def request_plan(
     *,
     improve: bool = False,
     planner: str = DEFAULT_PLANNER,
+    search_seconds: float = 0.0,
 ) -> PlanRequest:
     """Return the input of a plan from the fleet's state.
 
@@ -157,6 +163,7 @@ def request_plan(
         members: Robots that need new paths, the first ones first; none: one plan is made for all.
         improve: Look for better paths instead; no robot needs a new one.
         planner: Name of the planner that makes a plan for all.
+        search_seconds: Time in which the search for such a plan is repeated.
     """
     for_all = not members and not improve
     # Better paths are compared by what they took when they were planned.
@@ -206,6 +213,7 @@ def request_plan(
         ),
         copy=None if for_all else copy_ledger(state, robots, members),
         improve_seconds=settings.improve_seconds if improve else 0.0,
+        search_seconds=search_seconds,
     )
 
 
@@ -302,6 +310,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         urgency=request.urgency or None,
         lifelong=True,
         own_costs=own_costs,
+        search_seconds=request.search_seconds,
     )
     joint = (planner or load_planner(request.planner)).plan(problem)
     if request.planner not in BUILT_IN_PLANNERS:
@@ -327,6 +336,7 @@ def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanRe
         ),
         complete=joint.complete and not is_cut,
         ordered=joint.conflict_free,
+        impossible=joint.impossible,
     )
 
 

@@ -98,6 +98,7 @@ class RobotRecord:
         rest: The cell it returns to when it has no goal.
         unreachable: Whether no path leads to its goal.
         full_zone: The limited zone in which it waits for room, if only that is why; empty: none.
+        no_path: Why the newest plan for all has no path to its goal, for people; empty: it has one.
         centred: Whether it has been at the centre of its cell since it was placed there.
         leaving: Whether it drives out of a cell in which another robot waits; it is granted no more until it
             is at the centre of the next.
@@ -132,6 +133,7 @@ class RobotRecord:
     rest: int | None = None
     unreachable: bool = False
     full_zone: str = ""
+    no_path: str = ""
     centred: bool = False
     leaving: bool = False
     replans: int = 0

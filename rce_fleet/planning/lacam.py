@@ -32,7 +32,7 @@ from rce_fleet.planning.smoothing import smooth, smoothed
 from rce_fleet.planning.straightening import ends_of, straighten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -56,6 +56,8 @@ _SMOOTHING = 1000
 """States of searches by robot, with which a plan is made straighter."""
 _NEXT_SEED = 7919
 """Added to the seed for another search."""
+_MOST_CONFIGURATIONS = 50_000
+"""Of a search that is repeated in ``search_seconds``: each takes some kB of the planner's process."""
 KERNELS = (*FIELD_KERNELS, roll_out, improve, enter_all, straighten, smooth, execute)
 
 
@@ -94,9 +96,9 @@ class LacamPlanner:
         if len(part.starts) >= _GUIDED_FROM * len(guide):
             guide = part.compact(guided(problem.graph))
         if problem.motion is not None:
-            return self._plan_in_motion(part, problem, problem.motion, guide, began + problem.seconds)
+            return self._plan_in_motion(part, problem, problem.motion, guide, began)
         deadline = began + problem.seconds
-        cells, complete, impossible = _first(part, problem, guide, deadline)
+        cells, complete, impossible = _first(part, problem, guide, began)
         if not problem.rotations:
             _cut_loops(part, problem, cells)
         joint = JointPlan(part.original(cells), complete, impossible=impossible)
@@ -124,7 +126,7 @@ class LacamPlanner:
         problem: PlanningProblem,
         motion: Motion,
         guide: PlanningGraph,
-        deadline: float,
+        began: float,
     ) -> JointPlan:
         """Return the plan that real robots carry out soonest, of those with and without regard to turns."""
         directions = part.edges(edge_directions(problem.graph))
@@ -133,30 +135,28 @@ class LacamPlanner:
         if guide is not part.graph or part.own_costs:
             own_costs = part.own_costs_on(guide)
             guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden, own_costs)
-        best, least = JointPlan(part.original(part.starts[None]), complete=False), float("inf")
-        seed = problem.seed
-        effort = min(problem.effort, _SMOOTHING * len(part.starts))
+        best, least = JointPlan(part.original(part.starts[None]), complete=False), (0, float("inf"))
+        seed, effort = problem.seed, problem.effort
         while True:
+            before = perf_counter()
             for choice in (guided_turning, None):
-                cells, complete, _ = _search(part, problem, guide, seed, choice)
-                for smooth_effort in (0, effort) if complete else (0,):
-                    if smooth_effort:
-                        cells = smoothed(
-                            part.graph.unweighted, cells, part.goals, turning, stop=motion.stop,
-                            rotations=problem.rotations, effort=smooth_effort, seed=seed,
-                        )  # fmt: skip
-                    elif not problem.rotations:
-                        _cut_loops(part, problem, cells)
-                    joint = JointPlan(part.original(cells), complete)
+                found = _search(part, problem, guide, seed, choice, effort)
+                for cells in _straighter(part, problem, found, turning, motion, seed):
+                    joint = JointPlan(part.original(cells), found.complete)
                     took = float(execution_times(joint.cells, problem.graph.columns, motion).sum())
                     took += problem.extra_cost(joint.cells)
-                    if (not complete, took) < (not best.complete, least):
-                        if self._on_first is not None and complete and not best.complete:
+                    if (-_at_goals(part, cells), took) < least:
+                        if self._on_first is not None and found.complete and not best.complete:
                             self._on_first(joint)
-                        best, least = joint, took
-            seed += _NEXT_SEED
-            if perf_counter() >= deadline:
+                        best, least = joint, (-_at_goals(part, cells), took)
+                if found.impossible:
+                    return replace(best, impossible=True)
+            now, deadline = perf_counter(), began + _time_for(problem, found=best.complete)
+            if now >= deadline:
                 return best
+            seed += _NEXT_SEED
+            if not best.complete:
+                effort = _grown(problem, effort, now - before, deadline - now)
 
 
 def plan(
@@ -207,17 +207,63 @@ def _cut_loops(part: Compaction, problem: PlanningProblem, cells: Ints) -> None:
         straighten(cells, nodes, ends_of(cells, part.goals, lifelong=problem.lifelong))
 
 
-def _first(part: Compaction, problem: PlanningProblem, graph: PlanningGraph, deadline: float) -> _Found:
-    """Search with the problem's effort, then with other seeds and more effort while time is left."""
-    seed, effort = problem.seed, problem.effort
+def _first(part: Compaction, problem: PlanningProblem, graph: PlanningGraph, began: float) -> _Found:
+    """Search with the problem's effort, then with other seeds and more effort while time is left.
+
+    Returns:
+        The plan; of plans that are not complete the one with most robots at their goals.
+    """
+    seed, effort, deadline = problem.seed, problem.effort, began + _time_for(problem, found=False)
+    best: _Found | None = None
     while True:
-        began = perf_counter()
+        before = perf_counter()
         found = _search(part, problem, graph, seed, effort=effort)
         now = perf_counter()
+        if best is None or found.complete or _at_goals(part, found.cells) > _at_goals(part, best.cells):
+            best = found
         if found.complete or found.impossible or now >= deadline:
-            return found
+            return best._replace(impossible=found.impossible)
         seed += _NEXT_SEED
-        effort = int(effort * min(2.0, (deadline - now) / (now - began))) + len(part.starts)
+        effort = _grown(problem, effort, now - before, deadline - now)
+
+
+def _straighter(
+    part: Compaction, problem: PlanningProblem, found: _Found, turning: Turning, motion: Motion, seed: int
+) -> Iterator[Ints]:
+    """Yield a plan, and if it is complete another one in which robots are planned anew, with turns."""
+    if not problem.rotations:
+        _cut_loops(part, problem, found.cells)
+    yield found.cells
+    if found.complete:
+        yield smoothed(
+            part.graph.unweighted, found.cells, part.goals, turning, stop=motion.stop,
+            rotations=problem.rotations, effort=min(problem.effort, _SMOOTHING * len(part.starts)), seed=seed,
+        )  # fmt: skip
+
+
+def _time_for(problem: PlanningProblem, *, found: bool) -> float:
+    """Return how many seconds a plan may take, if a complete one is found, or is not."""
+    return problem.seconds if found else max(problem.seconds, problem.search_seconds)
+
+
+def _grown(problem: PlanningProblem, effort: int, took: float, left: float) -> int:
+    """Return the effort of the next search.
+
+    Args:
+        problem: What is asked for.
+        effort: The effort of the search that found no complete plan.
+        took: What that took, seconds.
+        left: Seconds that are left.
+    """
+    grown = int(effort * min(2.0, left / took)) + len(problem.starts)
+    if problem.seconds:
+        return grown
+    return min(grown, max(problem.effort, _MOST_CONFIGURATIONS * len(problem.starts)))
+
+
+def _at_goals(part: Compaction, cells: Ints) -> int:
+    """Return how many robots are at their goals at the end of a plan."""
+    return int((cells[-1] == part.goals).sum())
 
 
 def _search(

@@ -50,7 +50,8 @@ class PlanningProblem:
         graph: Where robots can be and drive.
         starts: Node of each robot, shape (robots,), all different.
         goals: Goal of each robot, shape (robots,), all different.
-        seed: The same problem with the same seed and no ``seconds`` gives the same plan.
+        seed: The same problem with the same seed and no ``seconds``, nor ``search_seconds``, gives the same
+            plan.
         effort: Moves of single robots that are tried at most until the first plan is found; more
             while ``seconds`` are left.
         seconds: Time for the whole plan; what the first plan leaves is used to improve it.
@@ -65,6 +66,8 @@ class PlanningProblem:
             its goal does not count, unless it starts there. A planner may ignore it.
         own_costs: For some robots the cost of every edge, shape (edges,), by the robot's index; the graph's
             costs are those of the others. Robots with the same costs share an array. A planner may ignore it.
+        search_seconds: Time in which the search for a first plan is repeated with other seeds and more effort
+            if it finds none; no plan is improved in it. A planner may ignore it.
     """
 
     graph: PlanningGraph
@@ -79,6 +82,7 @@ class PlanningProblem:
     urgency: Ints | None = None
     lifelong: bool = False
     own_costs: Mapping[int, Ints] | None = None
+    search_seconds: float = 0.0
 
     @classmethod
     def of(
@@ -96,6 +100,7 @@ class PlanningProblem:
         urgency: Sequence[int] | None = None,
         lifelong: bool = False,
         own_costs: Mapping[int, Ints] | None = None,
+        search_seconds: float = 0.0,
     ) -> PlanningProblem:
         """Return the problem with these starts and goals.
 
@@ -138,6 +143,7 @@ class PlanningProblem:
             None if urgency is None else np.array(urgency, dtype=np.int32),
             lifelong,
             own_costs,
+            search_seconds,
         )
 
     @cached_property

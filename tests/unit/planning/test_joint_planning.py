@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rce_fleet.compiled import Kernel
+from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import PlanningError
 from rce_fleet.planning import fields, improvement, lacam
 from rce_fleet.planning.checker import check_plan
@@ -21,6 +22,7 @@ from rce_fleet.planning.graph import MAX_COST, PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.guidance import DOWN, LEFT, RIGHT, UP, aisle_factors, guided
 from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.lanes import Lane, LaneGraph
 from rce_fleet.planning.lifelong import LIFELONG_KERNELS, LifelongPlanner, LifelongSettings
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import JointPlan, PlanningProblem
@@ -134,6 +136,36 @@ def test_time_that_is_left_goes_into_the_search_for_a_first_plan() -> None:
     assert not planner.plan(problem).complete  # ten configurations are too few
     with pytest.raises(FoundError):
         planner.plan(replace(problem, seconds=120.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", [None, Motion(0.75, 0.5, (0,) * 40)], ids=["steps", "with turns"])
+def test_a_search_is_repeated_until_a_plan_is_found(motion: Motion | None) -> None:
+    """The rest of the hour is not used."""
+    problem = problem_of(SHELVES, sorted(SHELVES.free), 40, 3, effort=400, motion=motion)
+    planner = LacamPlanner(compiled=False)
+    assert not planner.plan(problem).complete  # ten configurations are too few
+    assert planner.plan(replace(problem, search_seconds=3600.0)).complete
+
+
+@pytest.mark.slow
+def test_robots_on_a_one_way_ring_need_a_longer_search() -> None:
+    """One of 30 robots has no way past the others with the effort of a fleet without compiled loops."""
+    side, across = range(12), (3, 6, 9)
+    ring = [*side, *range(23, 144, 12), *range(142, 131, -1), *range(120, -1, -12)]
+    lanes = LaneGraph(
+        (
+            Lane("ring", tuple(ring), one_way=True),
+            *(Lane(f"row {row}", tuple(12 * row + column for column in side)) for row in across),
+            *(Lane(f"column {column}", tuple(12 * row + column for row in side)) for column in across),
+        )
+    )
+    grid, rng = lanes.restrict(GridMap(12, 12)), Random(0)
+    starts, goals = rng.sample(grid.free, 30), rng.sample(grid.free, 30)
+    problem = PlanningProblem.of(lanes.graph(grid), starts, goals, effort=FleetSettings().effort)
+    planner = LacamPlanner(compiled=False)
+    assert (planner.plan(problem).cells[-1] == goals).sum() == 29
+    assert planner.plan(replace(problem, search_seconds=3600.0)).complete
 
 
 @pytest.mark.slow
