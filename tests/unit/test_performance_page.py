@@ -142,7 +142,7 @@ def test_goals_of_dijkstra_stand_beside_those_of_lacam(
     results = json.loads((folder / "throughput.json").read_text(encoding="utf-8"))
     table = block("throughput.goals", merged({}, "throughput", results))
     if robots is None:
-        assert table == "Not measured yet: `python -m benchmarks.throughput`.\n"
+        assert table == "Not measured yet: `.venv/bin/python -m benchmarks.throughput`.\n"
     else:
         assert f"| lacam | paths as planned | {robots} | [7, 7, 7] | 84 |" in table
         assert f"| dijkstra | shortest paths | {robots} | [7, 7, 7] | 84 |" in table
