@@ -21,6 +21,8 @@ LEAST_FACTOR, MOST_FACTOR = 0.01, 1e6
 """How much a metre in a zone counts for a robot. A sum of ways must grow with each metre."""
 MOST_ROOM = 10**6
 """Most robots for which a limited zone can have room."""
+MOST_ZONES = 1000
+"""Zones at the same time: each change of one looks at all of them, for each robot."""
 MOST_REASON = 500
 """Characters of a reason."""
 MOST_LIFETIME = 1e10

@@ -23,6 +23,7 @@ from rce_fleet.coordination.refusals import describe_zone, refuse_block
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.exceptions import ZoneError
+from rce_fleet.limits import MOST_ZONES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -76,15 +77,16 @@ class CellBlocking:
     def free_latest_of(self, robot: str) -> None:
         """Free what a robot reported of late, and no other one since: it was not where its poses said."""
         since = self._dispatcher.now - DOUBTFUL_S
+        found = []
         for cell in sorted(self._state.sensed):
             witness, at = self._witnesses.get(cell, ("", 0.0))
             if witness == robot and at >= since:
-                self.take_robot(cell)
+                found.append(cell)
+        self._free_sensed(found)
 
     def take_gone(self, event: ObstacleGone) -> None:
         """Free those of the cells that sensors found blocked, if the robot can see them from where it is."""
-        for cell in self._believable(event):
-            self.take_robot(cell)
+        self._free_sensed(self._believable(event))
 
     def _believable(self, event: ObstacleSeen | ObstacleGone) -> list[int]:
         """Return the cells of a report that are on the grid and that its robot can see.
@@ -112,9 +114,14 @@ class CellBlocking:
 
     def take_robot(self, cell: int) -> None:
         """Free a cell that sensors found blocked and that a robot is in: they saw that robot."""
-        if cell in self._state.sensed:
+        self._free_sensed([cell])
+
+    def _free_sensed(self, cells: Iterable[int]) -> None:
+        """Free those of the cells that only sensors blocked, together: each time looks at all robots."""
+        seen = [cell for cell in dict.fromkeys(cells) if cell in self._state.sensed]
+        for cell in seen:
             self._state.drop_block(cell)
-            self._release([cell])
+        self._release(seen)
 
     # Requests
 
@@ -167,6 +174,9 @@ class CellBlocking:
         except ZoneError as error:
             return Reply(False, str(error))
         remove = set(event.remove) | (book.zones.keys() - set(names) if event.replace else set())
+        count = len((book.zones.keys() - remove).union(names))
+        if count > max(MOST_ZONES, len(book.zones)):
+            return Reply(False, f"there can be {MOST_ZONES} zones, not {count}: remove some")
         made = self._change_zones(event.zones, remove)
         return Reply(True, f"{made} zones changed; their revision is {book.revision}")
 

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from rce_fleet.planning.lanes import LaneGraph
 
 
+MOST_NAMED = 5
+"""So many cells are named in an error: a request may have very many."""
+
+
 class ZoneKind(Enum):
     """What a zone does."""
 
@@ -104,15 +108,18 @@ class Zone:
             ZoneError: It cannot; the text says why.
         """
         where = f"zone {self.id!r}"
-        outside = [
-            cell for cell in (*self.cells, *(c for edge in self.edges for c in edge)) if cell not in grid
-        ]
+        cells = {*self.cells, *(cell for edge in self.edges for cell in edge)}
+        outside = sorted(cell for cell in cells if cell not in grid)
+        more = f" and {len(outside) - MOST_NAMED} more" if len(outside) > MOST_NAMED else ""
         far = [
             edge for edge in self.edges if edge[0] in grid and edge[1] in grid and not grid.adjacent(*edge)
         ]
         checks = (
             (not self.id, "a zone needs an id"),
-            (bool(outside), f"{where}: cells {sorted(set(outside))} are not on the map of {len(grid)} cells"),
+            (
+                bool(outside),
+                f"{where}: cells {outside[:MOST_NAMED]}{more} are not on the map of {len(grid)} cells",
+            ),
             (bool(far), f"{where}: cells of edge {far[:1]} are not neighbours"),
             (not self.cells and not self.edges, f"{where} has no cells"),
             (

@@ -39,6 +39,14 @@ def test_a_sensed_cell_is_freed_when_it_is_seen_free(planner: FleetPlanner) -> N
     planner.validate()
 
 
+def test_cells_that_are_seen_free_are_freed_together(planner: FleetPlanner) -> None:
+    """With a list of all blocked cells for each of them, one robot could keep the planner busy."""
+    planner.handle(ObstacleSeen("Robot1", (5, 6, 9, 10)), 1.0)
+    assert blocked(planner.handle(ObstacleGone("Robot1", (5, 6, 6, 9, 5)), 2.0)) == [(10,)]
+    assert planner.state.sensed == {10}
+    planner.validate()
+
+
 def test_another_robot_may_see_that_a_cell_is_free(planner: FleetPlanner) -> None:
     planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
     planner.handle(PoseSeen("Robot2", 3.5, 3.5, 0.0), 1.5)

@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rce_fleet.coordination import blocking
 from rce_fleet.coordination.events import (
     CellBlocked,
     CellFreed,
     GoalSet,
     ModeSet,
+    Reply,
     SendCells,
     Tick,
     ZonesSet,
@@ -225,6 +227,7 @@ def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
         (blocked("", 1), "a zone needs an id"),
         (blocked("a"), "zone 'a' has no cells"),
         (blocked("a", 27), r"zone 'a': cells \[27\] are not on the map of 27 cells"),
+        (blocked("a", *range(20, 50)), r"cells \[27, 28, 29, 30, 31\] and 18 more are not on the map"),
         (blocked("a", edges=((0, 2),)), "are not neighbours"),
         (Zone("a", ZoneKind.SLOW, (1,)), "needs 0.01 .. 100 m/s, not 0.0"),
         (Zone("a", ZoneKind.SLOW, (1,), speed=1e-320), "needs 0.01 .. 100 m/s, not 1e-320"),
@@ -239,6 +242,23 @@ def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
 def test_a_zone_that_cannot_be_is_refused(zone: Zone, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         zone.check(LOOP)
+
+
+def test_too_many_zones_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that makes a new one each minute must not stop the planner after some weeks."""
+    monkeypatch.setattr(blocking, "MOST_ZONES", 2)
+    planner = FleetPlanner(LOOP)
+
+    def put_some(*names: str, **more: Any) -> Reply:
+        event = ZonesSet(tuple(blocked(name, 1) for name in names), **more)
+        return next(one for one in planner.handle(event, 0.0) if isinstance(one, Reply))
+
+    assert put_some("a", "b").ok
+    assert put_some("c") == Reply(False, "there can be 2 zones, not 3: remove some")
+    assert put_some("a").ok
+    assert put_some("c", remove=("a",)).ok
+    assert put_some("d", "e", replace=True).ok
+    assert set(planner.state.zones.zones) == {"d", "e"}
 
 
 def test_the_slowest_zone_has_a_cost() -> None:
