@@ -18,6 +18,7 @@ from rce_fleet.limits import (
 )
 
 ZoneKindName = Literal["blocked", "slow", "one_way", "limited", "cost"]
+ZoneFactor = Annotated[float, Field(ge=LEAST_FACTOR, le=MOST_FACTOR)]
 _FORMER_KINDS = {"one-way": "one_way", "room": "limited"}
 
 
@@ -45,9 +46,13 @@ class ProfileModel(ApiModel):
     charging: float = Field(
         default=30.0, description="Watts that a charger gives.", ge=LEAST_CAPACITY, le=MOST_AMOUNT
     )
-    zone_cost: dict[str, Annotated[float, Field(ge=LEAST_FACTOR, le=MOST_FACTOR)]] = Field(
+    zone_cost: dict[str, ZoneFactor] = Field(
         default_factory=dict,
         description="How much a metre counts for it, by zone; 1 is as elsewhere.",
+    )
+    loaded_zone_cost: dict[str, ZoneFactor] = Field(
+        default_factory=dict,
+        description="The same for its planned ways while it carries a load, in place of zone_cost.",
     )
 
 

@@ -13,6 +13,7 @@ from rce_fleet.coordination.events import (
     CellBlocked,
     CellFreed,
     CellsIgnored,
+    CostsSet,
     ObstacleGone,
     ObstacleSeen,
     Reply,
@@ -23,7 +24,7 @@ from rce_fleet.coordination.refusals import describe_zone, refuse_block
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.exceptions import ZoneError
-from rce_fleet.limits import MOST_ZONES
+from rce_fleet.limits import LEAST_FACTOR, MOST_FACTOR, MOST_ZONES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -179,6 +180,17 @@ class CellBlocking:
             return Reply(False, f"there can be {MOST_ZONES} zones, not {count}: remove some")
         made = self._change_zones(event.zones, remove)
         return Reply(True, f"{made} zones changed; their revision is {book.revision}")
+
+    def set_costs(self, event: CostsSet) -> Reply:
+        """Set what metres in zones count for single robots; paths that are planned from now on follow."""
+        for robot, costs in event.costs.items():
+            for zone, factor in costs.items():
+                if not LEAST_FACTOR <= factor <= MOST_FACTOR:
+                    limits = f"{LEAST_FACTOR:g} .. {MOST_FACTOR:g}"
+                    return Reply(False, f"a metre in zone {zone!r} counts {limits} for {robot}, not {factor}")
+        if self._state.zones.set_own_costs(event.costs):
+            self._state.map_version += 1
+        return Reply(True, f"{len(event.costs)} robots have costs of their own in zones")
 
     def end_expired(self, now: float) -> None:
         """Remove the zones and the blocks of cells that have ended."""

@@ -146,6 +146,18 @@ class ZonesSet:
 
 
 @dataclass(frozen=True, slots=True)
+class CostsSet:
+    """Metres in zones count otherwise for single robots from now on. Answered by :class:`Reply`.
+
+    Attributes:
+        costs: How much a metre counts, by robot and id of the zone, in place of what the zone says. It
+            replaces all such costs that were set before.
+    """
+
+    costs: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True, slots=True)
 class ModeSet:
     """A robot, or (without one) the fleet, gets a mode. Answered by :class:`Reply`.
 
@@ -186,6 +198,7 @@ Event = (
     | CellFreed
     | RobotRemoved
     | ZonesSet
+    | CostsSet
     | ModeSet
     | PlanMade
     | Tick

@@ -39,7 +39,7 @@ class FleetState:
         zones: Zones of the map, and lanes.
         mode: The fleet's mode; counts for robots whose own mode is automatic.
         mode_reason: Why the fleet has its mode, and who set it.
-        map_version: Changes when cells or zones do.
+        map_version: Changes when cells, zones or robots' costs in zones do.
         learned: Steps that moves take for which robots waited of late, see
             :mod:`rce_fleet.coordination.congestion`; empty: nothing is learned.
         index: Indexes of the robots.

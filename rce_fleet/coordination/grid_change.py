@@ -69,6 +69,7 @@ def next_planner(planner: FleetPlanner, grid: GridMap, now: float) -> tuple[Flee
     by_people = _carried_blocks(old.grid, grid, old.requested)
     zones = carried_zones(old.zones.zones.values(), lambda cells: carried_cells(old.grid, grid, cells))
     made.state.zones.put(zones)
+    made.state.zones.set_own_costs(old.zones.own_costs)
     made.state.mode, made.state.mode_reason = old.mode, old.mode_reason
     by_zones = {
         cell for zone in zones if zone.kind is ZoneKind.BLOCKED and not zone.robots for cell in zone.cells

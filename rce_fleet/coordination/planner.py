@@ -24,6 +24,7 @@ from rce_fleet.coordination.dispatcher import Dispatcher
 from rce_fleet.coordination.events import (
     CellBlocked,
     CellFreed,
+    CostsSet,
     Event,
     GoalSet,
     Instruction,
@@ -102,6 +103,7 @@ class FleetPlanner:
             CellBlocked: self._blocking.block_cell,
             CellFreed: self._blocking.free_cell,
             ZonesSet: self._blocking.set_zones,
+            CostsSet: self._blocking.set_costs,
             ModeSet: self._modes.set_mode,
             RobotRemoved: self._remove_robot,
             PlanMade: lambda event: self._dispatcher.take_plan(event.result),

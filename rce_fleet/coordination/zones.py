@@ -95,7 +95,7 @@ class Zone:
             factor = NOMINAL_SPEED / self.speed
         elif self.kind is ZoneKind.COST:
             factor = self.cost
-        return max(ceil(min(factor, MOST_COST)), 1)
+        return _steps(factor)
 
     def applies_to(self, robot: str) -> bool:
         """Return whether the zone's rule is for this robot."""
@@ -158,6 +158,8 @@ class ZoneBook:
         zones: By id.
         lanes: See above.
         revision: Grows with each change; 0 before the first.
+        own_costs: How much a metre in zones counts for single robots, in place of what the zones say; by
+            robot and id of the zone, which need not exist.
     """
 
     def __init__(self, lanes: LaneGraph | None = None) -> None:
@@ -165,12 +167,13 @@ class ZoneBook:
         self._off_lanes: frozenset[tuple[int, int]] | None = None
         self.zones: dict[str, Zone] = {}
         self.revision = 0
+        self.own_costs: Mapping[str, Mapping[str, float]] = {}
         self._forget()
 
     def _forget(self) -> None:
         """Forget what was computed from the zones."""
         self._closed: frozenset[tuple[int, int]] | None = None
-        self._costs: dict[tuple[str, ...], dict[int, int]] = {}
+        self._costs: dict[tuple[tuple[str, int], ...], dict[int, int]] = {}
         self._costs_of: dict[str, dict[int, int]] = {}
         self._cells: dict[str, frozenset[int]] = {}
         self._blocking: dict[int, Zone] | None = None
@@ -197,6 +200,14 @@ class ZoneBook:
             self.revision += 1
             self._forget()
         return gone, made
+
+    def set_own_costs(self, costs: Mapping[str, Mapping[str, float]]) -> bool:
+        """Replace all own costs of robots, see :attr:`own_costs`; return whether they changed."""
+        if costs == self.own_costs:
+            return False
+        self.own_costs = {robot: dict(factors) for robot, factors in costs.items()}
+        self._forget()
+        return True
 
     def expired(self, now: float) -> list[str]:
         """Return the ids of zones that have ended."""
@@ -270,30 +281,34 @@ class ZoneBook:
 
     def costs(self) -> Mapping[int, int]:
         """Return the cost of entering cells of slow zones and cost zones for all robots; others cost 1."""
-        return self._costs_in([zone for zone in self._costly() if not zone.robots])
+        return self._costs_in((zone, zone.weight) for zone in self.zones.values() if not zone.robots)
 
     def costs_of(self, robot: str) -> Mapping[int, int]:
         """Return the cost of entering cells for one robot.
 
-        Robots with the same zones share one object; it is that of :meth:`costs` for those without own zones.
+        Robots with the same costs share one object; it is that of :meth:`costs` for those without own ones.
         """
         found = self._costs_of.get(robot)
         if found is None:
-            found = self._costs_in([zone for zone in self._costly() if zone.applies_to(robot)])
-            self._costs_of[robot] = found
+            own = self.own_costs.get(robot, {})
+            weighted = (
+                (zone, _steps(own[zone.id]) if zone.id in own else zone.weight)
+                for zone in self.zones.values()
+                if zone.id in own or zone.applies_to(robot)
+            )
+            found = self._costs_of[robot] = self._costs_in(weighted)
         return found
 
-    def _costly(self) -> list[Zone]:
-        return [zone for zone in self.zones.values() if zone.weight > 1]
-
-    def _costs_in(self, zones: list[Zone]) -> dict[int, int]:
-        key = tuple(zone.id for zone in zones)
+    def _costs_in(self, weighted: Iterable[tuple[Zone, int]]) -> dict[int, int]:
+        """Return the cost of entering the cells of zones, given with their weights."""
+        costly = [(zone, weight) for zone, weight in weighted if weight > 1]
+        key = tuple((zone.id, weight) for zone, weight in costly)
         found = self._costs.get(key)
         if found is None:
             found = self._costs[key] = {}
-            for zone in zones:
+            for zone, weight in costly:
                 for cell in zone.cells:
-                    found[cell] = max(found.get(cell, 1), zone.weight)
+                    found[cell] = max(found.get(cell, 1), weight)
         return found
 
     def speed_limit(self, robot: str, cells: Sequence[int]) -> float:
@@ -321,6 +336,11 @@ class ZoneBook:
                 if len(others) >= zone.capacity:
                     found.append(self.cells(zone))
         return union_of(found)
+
+
+def _steps(factor: float) -> int:
+    """Return the cost of entering a cell where a metre counts so much."""
+    return max(ceil(min(factor, MOST_COST)), 1)
 
 
 def _closed_by(zones: Iterable[Zone], grid: GridMap) -> frozenset[tuple[int, int]]:

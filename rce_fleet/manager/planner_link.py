@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol, assert_never
 
-from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, SetMode, SetZone
+from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, SetCosts, SetMode, SetZone
 
 if TYPE_CHECKING:
     from rce_fleet.tasks.records import CellBlock, Zone
+    from rce_fleet.tasks.zone_costs import OwnCosts
 
 
 class PlannerLink(Protocol):
@@ -25,6 +26,9 @@ class PlannerLink(Protocol):
     async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
         """Make or replace a zone; None: remove it."""
 
+    async def set_costs(self, costs: OwnCosts) -> str:
+        """Set what metres in zones count for single robots, in place of all such costs before."""
+
 
 async def carry_out(planner: PlannerLink, call: PlannerCall, now: float) -> str:
     """Call one of the planner's services; return why it refused.
@@ -39,6 +43,8 @@ async def carry_out(planner: PlannerLink, call: PlannerCall, now: float) -> str:
             return await planner.set_mode(robot, mode, reason, user)
         case SetZone(name, zone):
             return await planner.set_zone(name, zone, now)
+        case SetCosts(costs):
+            return await planner.set_costs(costs)
         case BlockCell(cell, blocked, block):
             return await planner.block_cell(cell, block if blocked else None, now)
         case _:

@@ -7,13 +7,13 @@ knows none of them, and gets the journal's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.limits import MOST_LIFETIME
 from rce_fleet.manager.cell_blocks import describe_block
-from rce_fleet.manager.mirror import SETTLE_S, Mirror
+from rce_fleet.manager.mirror import REFUSED_S, SETTLE_S, Mirror
 from rce_fleet.manager.zones import rule
 from rce_fleet.tasks.other_floor import leave_floor
 from rce_fleet.tasks.records import (
@@ -26,10 +26,12 @@ from rce_fleet.tasks.records import (
     RobotEntry,
     Zone,
 )
+from rce_fleet.tasks.zone_costs import own_costs
 
 if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.facts import FleetFacts
+    from rce_fleet.tasks.zone_costs import OwnCosts
 
 CELLS_DELAY_S = 6.0
 """Longest time after which the planner's list of blocked cells has an accepted one: a list counts only when
@@ -74,7 +76,14 @@ class BlockCell:
     block: CellBlock = NOT_KNOWN
 
 
-PlannerCall: TypeAlias = SetMode | SetZone | BlockCell
+@dataclass(frozen=True, slots=True)
+class SetCosts:
+    """Set what metres in zones count for single robots, for all robots at once."""
+
+    costs: OwnCosts = field(repr=False)
+
+
+PlannerCall: TypeAlias = SetMode | SetZone | SetCosts | BlockCell
 
 
 class PlannerSync:
@@ -95,6 +104,10 @@ class PlannerSync:
         """Which revision of a zone the planner accepted last, and when."""
         self._told_blocks: dict[int, tuple[CellBlock, float]] = {}
         """Who blocked a cell, and why, as the planner accepted it last, and when."""
+        self._costs: OwnCosts | None = None
+        """The own costs of robots that the planner has; None: not known."""
+        self._costs_from = -inf
+        """When they may be sent again."""
         self._run = PlannerRun()
         self._unlisted: dict[int, float] = {}
         """Until when the planner's list need not have cells that are blocked since a robot has left them."""
@@ -129,6 +142,8 @@ class PlannerSync:
         kept = book.blocked.cells if is_other_floor else ()
         self._told_blocks = {cell: (book.blocked.block(cell), now) for cell in kept}
         self._facts.requested = None if keeps else frozenset()  # a planner that begins has no requests
+        has_profiles = any(entry.profile is not None for entry in book.robots.values())
+        self._costs, self._costs_from = None if is_same and has_profiles else {}, -inf
         self._run = run
         self._unlisted.clear()
         self._note_run(now)
@@ -187,6 +202,9 @@ class PlannerSync:
             out.append(SetMode(name, mode or AUTOMATIC, entry.reason, entry.user))
         for key in self._zones.compare(*self._zones_of_both(), now, self._untold()).to_send:
             out.append(SetZone(key, book.zones.get(key)))
+        costs = own_costs(book)
+        if costs != self._costs and now >= self._costs_from:
+            out.append(SetCosts(costs))
         if self._facts.requested is not None:
             cells = self._cells.compare(*self._cells_of_both(), now, self._untold_cells()).to_send
             out += [BlockCell(cell, bool(one), book.blocked.block(cell)) for cell, one in cells.items()]
@@ -206,6 +224,9 @@ class PlannerSync:
             self._zones.sent(call.id, None if call.zone is None else rule(call.zone), now, refused=refused)
             if call.zone is not None and not refused:
                 self._told[call.id] = call.zone.revision, now
+        elif isinstance(call, SetCosts):
+            self._costs_from = now + REFUSED_S if refused else -inf
+            self._costs = self._costs if refused else call.costs
         else:
             self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
             if not refused:

@@ -42,10 +42,13 @@ from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
 from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
+from rce_fleet.nodes.zone_messages import costs_fields
 from rce_fleet.tasks.records import CellBlock, Places, Zone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from rce_fleet.tasks.zone_costs import OwnCosts
 
 SERVICE = "/fleet/request"
 """Every fleet manager provides this service."""
@@ -79,6 +82,7 @@ class PlannerServices:
         self._on_silence = on_silence
         self._set_goal = node.service_client("/fleet/set_goal", "fleet/SetGoal")
         self._block_cell = node.service_client("/fleet/block_cell", "fleet/BlockCell")
+        self._set_costs = node.service_client("/fleet/set_costs", "fleet/SetCosts")
         self._set_mode = node.service_client("/fleet/set_mode", "fleet/SetMode")
         self._set_zones = node.service_client("/fleet/set_zones", "fleet/SetZones")
 
@@ -110,6 +114,10 @@ class PlannerServices:
         """
         zones, remove = ([], [name]) if zone is None else ([zone_fields(zone, now)], [])
         return await self._call(self._set_zones, zones=zones, remove=remove, revision=-1)
+
+    async def set_costs(self, costs: OwnCosts) -> str:
+        """Set what metres in zones count for single robots; return why the planner refused."""
+        return await self._call(self._set_costs, **costs_fields(costs))
 
     async def _call(self, client: ServiceClient, **request: Any) -> str:
         try:

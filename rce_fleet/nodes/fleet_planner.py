@@ -51,7 +51,7 @@ from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
 from rce_fleet.nodes.state_publisher import StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
-from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
+from rce_fleet.nodes.zone_messages import read_costs_set, read_mode_set, read_zones_set
 from rce_fleet.planning.planner import INDEPENDENT
 
 if TYPE_CHECKING:
@@ -128,6 +128,7 @@ class PlannerNode:
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
         await node.advertise_service("/fleet/set_zones", "fleet/SetZones", self._set_zones)
+        await node.advertise_service("/fleet/set_costs", "fleet/SetCosts", self._set_costs)
         await node.advertise_service("/fleet/set_mode", "fleet/SetMode", self._set_mode)
         await node.advertise_service("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
         await self._poses.start()
@@ -237,6 +238,12 @@ class PlannerNode:
         except ZoneError as error:
             reply = {"ok": False, "message": str(error)}
         return {**reply, "revision": self._planner.state.zones.revision}
+
+    def _set_costs(self, request: Message) -> dict[str, Any]:
+        try:
+            return self._ask(read_costs_set(request))
+        except ZoneError as error:
+            return {"ok": False, "message": str(error)}
 
     def _set_mode(self, request: Message) -> dict[str, Any]:
         try:

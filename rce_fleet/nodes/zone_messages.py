@@ -1,4 +1,4 @@
-"""Reads and writes ``fleet/Zone``, and reads the requests ``fleet/SetZones`` and ``fleet/SetMode``."""
+"""Reads and writes ``fleet/Zone``; reads the requests ``fleet/SetZones``, ``SetCosts`` and ``SetMode``."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from enum import Enum
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rce_fleet.coordination.events import ModeSet, ZonesSet
+from rce_fleet.coordination.events import CostsSet, ModeSet, ZonesSet
 from rce_fleet.coordination.modes import read_mode
 from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
 from rce_fleet.exceptions import ZoneError
 from rce_fleet.limits import MOST_LIFETIME
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rce.ros.types import Message
 
 E = TypeVar("E", bound=Enum)
@@ -87,6 +89,36 @@ def read_zones_set(request: Message, now: float) -> ZonesSet:
         replace=request.replace,
         revision=None if request.revision < 0 else request.revision,
     )
+
+
+def read_costs_set(request: Message) -> CostsSet:
+    """Return the event of a ``fleet/SetCosts`` request.
+
+    Raises:
+        ZoneError: Its lists have different lengths.
+    """
+    lengths = len(request.robots), len(request.zones), len(request.costs)
+    if len(set(lengths)) > 1:
+        found = ", ".join(map(str, lengths))
+        raise ZoneError(f"robots, zones and costs must have as many entries each, not {found}")
+    costs: dict[str, dict[str, float]] = {}
+    for robot, zone, factor in zip(request.robots, request.zones, request.costs, strict=True):
+        costs.setdefault(robot, {})[zone] = factor
+    return CostsSet(costs)
+
+
+def costs_fields(costs: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return the fields of a ``fleet/SetCosts`` request.
+
+    Args:
+        costs: How much a metre counts, by robot and id of the zone.
+    """
+    rows = [(robot, zone, factor) for robot, own in costs.items() for zone, factor in own.items()]
+    return {
+        "robots": [robot for robot, _, _ in rows],
+        "zones": [zone for _, zone, _ in rows],
+        "costs": [factor for _, _, factor in rows],
+    }
 
 
 def read_mode_set(request: Message) -> ModeSet:

@@ -95,10 +95,13 @@ def _profile(profile: RobotProfile) -> RobotProfile:
         idle=within(profile.idle, 0.0, MOST_AMOUNT),
         acting=within(profile.acting, 0.0, MOST_AMOUNT),
         charging=within(profile.charging, LEAST_CAPACITY, MOST_AMOUNT),
-        zone_cost={
-            name: within(factor, LEAST_FACTOR, MOST_FACTOR) for name, factor in profile.zone_cost.items()
-        },
+        zone_cost=_factors(profile.zone_cost),
+        loaded_zone_cost=_factors(profile.loaded_zone_cost),
     )
+
+
+def _factors(costs: dict[str, float]) -> dict[str, float]:
+    return {name: within(factor, LEAST_FACTOR, MOST_FACTOR) for name, factor in costs.items()}
 
 
 def _zone(zone: Zone) -> Zone:

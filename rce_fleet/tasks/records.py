@@ -37,6 +37,7 @@ class RobotProfile:
         acting: Watts of an action at a stop, beside ``idle``.
         charging: Watts that a charger gives, ``idle`` included: for when a battery will be full.
         zone_cost: How much more a metre in a zone costs this robot than elsewhere: 2 counts double.
+        loaded_zone_cost: The same for its planned ways while it carries a load, in place of ``zone_cost``.
     """
 
     capabilities: tuple[str, ...] = ()
@@ -48,6 +49,7 @@ class RobotProfile:
     acting: float = 5.0
     charging: float = 30.0
     zone_cost: dict[str, float] = field(default_factory=dict)
+    loaded_zone_cost: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,10 @@
-"""What zones make of robots' ways: detours around what is closed to one of them, and dearer metres."""
+"""What zones make of robots' ways: detours around what is closed to one of them, and dearer metres. Pure."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.tasks.travel import CLOSES_MOVES
 
@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.facts import FleetFacts
     from rce_fleet.tasks.records import RobotProfile, Zone
+
+OwnCosts: TypeAlias = dict[str, dict[str, float]]
+"""How much a metre counts, by robot and zone, in place of what the zone says."""
 
 
 def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> dict[str, RobotProfile]:
@@ -52,4 +55,24 @@ def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> d
             closing = {zone.id: CLOSES_MOVES for zone in applied if zone.closes_moves}
             made[key] = replace(base, zone_cost={**costs, **base.zone_cost, **closing, **shut})
         found[robot] = made[key]
+    return found
+
+
+def own_costs(book: TaskBook) -> OwnCosts:
+    """Return what metres in zones count for single robots when the planner chooses their ways now.
+
+    Args:
+        book: Profiles, and the tasks that say which robots are loaded.
+    """
+    found: OwnCosts = {}
+    for robot, entry in book.robots.items():
+        profile = entry.profile
+        if profile is None or not (profile.zone_cost or profile.loaded_zone_cost):
+            continue
+        costs = dict(profile.zone_cost)
+        task = book.task_of(robot) if profile.loaded_zone_cost else None
+        if task is not None and task.is_loaded:
+            costs |= profile.loaded_zone_cost
+        if costs:
+            found[robot] = costs
     return found

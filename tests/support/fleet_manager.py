@@ -17,6 +17,7 @@ from rce_fleet.manager.zones import zone_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.records import CellBlock, Zone
+from rce_fleet.tasks.zone_costs import OwnCosts
 
 GO = {"stops": [{"cell": 5}]}
 
@@ -29,6 +30,7 @@ class Planner:
         self.calls: list[tuple[Any, ...]] = []
         self.requests: list[dict[str, Any]] = []
         """Requests to block or free cells, as the planner gets them."""
+        self.costs: list[OwnCosts] = []
         self.refusal = ""
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
@@ -48,13 +50,17 @@ class Planner:
         self.calls.append(("zone", name, None if zone is None else zone_fields(zone, now)["kind"]))
         return self.refusal
 
+    async def set_costs(self, costs: OwnCosts) -> str:
+        self.costs.append(costs)
+        return self.refusal
+
 
 class ManagerClient:
     """A manager with a journal, and a client of it."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, planner: Planner | None = None) -> None:
         self.journal = Journal(path)
-        self.planner = Planner()
+        self.planner = planner or Planner()
         self.manager = FleetManager(self.journal, self.planner, TaskRules(), logging.getLogger("manager"))
         self.manager.facts.grid = self.manager.book.grid = GridMap(blocked=frozenset({9}))
         self.manager.facts.shut = frozenset({9})

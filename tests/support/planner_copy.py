@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode
+from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetCosts, SetMode
 from rce_fleet.manager.zones import read_zone, zone_fields
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.records import PlannerRun, Zone
+from rce_fleet.tasks.zone_costs import OwnCosts
 
 RUN = PlannerRun("1.0", "8 x 8")
 SPILL = Zone("spill", "blocked", (5, 6), reason="oil", user="anna")
@@ -19,6 +20,7 @@ class Both:
         self.book = book or TaskBook()
         self.facts = FleetFacts(is_live=True, is_current=True, requested=frozenset())
         self.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+        self.costs: OwnCosts = {}
         self.sync = PlannerSync(self.book, self.facts)
         self.now = 1000.0
         self.sync.begin(run, self.now)
@@ -48,6 +50,8 @@ class Both:
             facts.blocks.pop(call.cell, None)
             if call.blocked:
                 facts.blocks[call.cell] = call.block
+        elif isinstance(call, SetCosts):
+            self.costs = call.costs
         elif call.zone is None:
             del facts.zones[call.id]
         else:

@@ -285,6 +285,22 @@ def test_costs_are_shared_by_robots_with_the_same_zones() -> None:
     assert book.costs_of("A") == {1: 3}
 
 
+def test_own_costs_of_a_robot_replace_those_of_zones() -> None:
+    """Zones of the same costs share one object, and a zone that comes later counts too."""
+    book = ZoneBook()
+    ramp = Zone("ramp", ZoneKind.COST, (1, 2), cost=2.0)
+    book.put([ramp, Zone("gate", ZoneKind.LIMITED, (3,), capacity=1)])
+    assert book.set_own_costs({"A": {"ramp": 1.0}, "B": {"gate": 3.5, "wet": 4.0}, "C": {"ramp": 1e6}})
+    assert not book.set_own_costs({"A": {"ramp": 1.0}, "B": {"gate": 3.5, "wet": 4.0}, "C": {"ramp": 1e6}})
+    assert (book.costs_of("A"), book.costs_of("C")) == ({}, {1: 20, 2: 20})
+    assert book.costs_of("B") == {1: 2, 2: 2, 3: 4}
+    assert book.costs_of("D") is book.costs()
+    book.put([Zone("wet", ZoneKind.COST, (4,), cost=1.0)])
+    assert (book.costs_of("B")[4], book.costs_of("D")) == (4, {1: 2, 2: 2})
+    assert book.set_own_costs({"A": {"ramp": 2.0}})
+    assert book.costs_of("A") is book.costs_of("B") is book.costs()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",

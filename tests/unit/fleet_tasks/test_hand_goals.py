@@ -20,6 +20,7 @@ from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.records import CellBlock, GoalEntry, Places, PlannerRun, RobotEntry, Zone
 from rce_fleet.tasks.task import TaskState
+from rce_fleet.tasks.zone_costs import OwnCosts
 
 RUN = PlannerRun("1.0", "8 x 8")
 LATER = PlannerRun("2.0", "8 x 8")
@@ -50,6 +51,9 @@ class Planner:
 
     async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
         raise AssertionError(name, zone, now)
+
+    async def set_costs(self, costs: OwnCosts) -> str:
+        raise AssertionError(costs)
 
 
 class Fleet:
