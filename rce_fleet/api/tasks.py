@@ -191,6 +191,13 @@ class TaskPage(ApiModel):
     next: str | None = Field(description="The cursor of the next page; null: this is the last.")
 
 
+class CancelledTasks(ApiModel):
+    """The tasks that a request for many cancelled."""
+
+    tasks: list[str] = Field(description="Their ids; those with a load on a robot bring it away first.")
+    left: int = Field(description="How many are left: send the request again until it is 0.")
+
+
 class LoadRequest(ApiModel):
     """Where the load of a task is whose robot does not come back."""
 

@@ -263,3 +263,24 @@ def cancel(task_id: Id, station: Station = STATION) -> None:
         typer.echo(f"{task.id} is {task.state}" + (", and does not recur" if task.repeat is not None else ""))
 
     do(station, work)
+
+
+@app.command("cancel-many")
+def cancel_many(
+    requester: Annotated[str, typer.Option(help="Only tasks of this user.")] = "",
+    state: Annotated[
+        str, typer.Option(help="Only these states, separated by commas; also open, ended and recurring.")
+    ] = "",
+    robot: Annotated[str, typer.Option(help="Only tasks that this robot does.")] = "",
+    station: Station = STATION,
+) -> None:
+    """Cancel all tasks of a user, of a robot, or in some states."""
+    if not requester and not state and not robot:
+        raise typer.BadParameter("say which tasks: --requester USER, --robot ROBOT, or --state open for all")
+
+    async def work(client: FleetClient) -> None:
+        wanted = list(filter(None, state.split(",")))
+        cancelled = await client.cancel_tasks(state=wanted, robot=robot, requester=requester)
+        typer.echo(f"{len(cancelled)} tasks are cancelled, or bring their loads away first")
+
+    do(station, work)

@@ -5,8 +5,16 @@ from __future__ import annotations
 import secrets
 from collections.abc import AsyncIterator, Iterable
 
-from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskModel, TaskPage, TaskRequest
-from rce_fleet.client.requests import ApiRequests, if_match, path_part
+from rce_fleet.api.tasks import (
+    CancelledTasks,
+    HoldRequest,
+    LoadRequest,
+    TaskChange,
+    TaskModel,
+    TaskPage,
+    TaskRequest,
+)
+from rce_fleet.client.requests import ApiRequests, if_match, parsed, path_part
 
 
 class TaskRequests(ApiRequests):
@@ -96,6 +104,37 @@ class TaskRequests(ApiRequests):
             ```
         """
         return await self._change("DELETE", f"/tasks/{path_part(task_id)}", TaskModel, None, revision)
+
+    async def cancel_tasks(
+        self, *, state: Iterable[str] = (), robot: str = "", requester: str = ""
+    ) -> list[str]:
+        """Cancel many tasks, each as :meth:`cancel_task` does; return their ids.
+
+        Tasks that have ended and recur no further are left as they are.
+
+        Args:
+            state: Only tasks in these states, also ``open``, ``ended`` and ``recurring``; empty: in all.
+            robot: Only tasks that this robot does.
+            requester: Only tasks of this user.
+
+        Raises:
+            ValueError: None of the three is given.
+
+        Example:
+            ```python
+            await fleet.cancel_tasks(requester="erp", state=["queued"])
+            ```
+        """
+        query = {"state": ",".join(state), "robot": robot, "requester": requester}
+        given = {key: text for key, text in query.items() if text}
+        if not given:
+            raise ValueError("give state, robot or requester: state=['open'] cancels all")
+        cancelled: list[str] = []
+        while True:
+            answer = parsed(CancelledTasks, await self._transport.request("DELETE", "/tasks", query=given))
+            cancelled += answer.tasks
+            if not answer.left:
+                return cancelled
 
     async def hold_task(self, task_id: str, reason: str = "", *, revision: int | None = None) -> TaskModel:
         """Hold a task until :meth:`resume_task`.

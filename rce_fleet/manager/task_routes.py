@@ -6,7 +6,15 @@ import asyncio
 from bisect import bisect_left, bisect_right
 from typing import TYPE_CHECKING
 
-from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskPage, TaskRequest
+from rce_fleet.api.tasks import (
+    CancelledTasks,
+    HoldRequest,
+    LoadRequest,
+    TaskChange,
+    TaskPage,
+    TaskRequest,
+)
+from rce_fleet.exceptions import UnknownTaskError
 from rce_fleet.manager.convert import changed_order, read_order, show_task
 from rce_fleet.manager.requests import BadRequestError, Call, FleetAnswer, Route, problem, shown
 from rce_fleet.tasks.loads import settle_load
@@ -19,8 +27,12 @@ if TYPE_CHECKING:
 MOST_OPEN = 10_000
 """Tasks that have not ended; more are refused until some have. Each step looks at all of them: at so many for
 20 ms, at 50 000 for 0.3 s, in which nothing else is answered."""
+MOST_OF_ONE = 8_000
+"""Those of one requester, so that a program in a loop leaves room for the tasks of others."""
+MOST_CANCELLED = 1_000
+"""Tasks that one request cancels."""
 _AT_ONCE = 100
-"""Tasks of a page that are shown without a pause, so that a step need not wait for a large page."""
+"""Tasks of a page that are shown or cancelled without a pause, so that a step need not wait for all."""
 _MORE_STATES = ("open", "ended", "recurring")
 """Words for several states; recurring: another occurrence follows, also if this one has ended."""
 
@@ -33,8 +45,8 @@ async def create(call: Call) -> FleetAnswer:
         raise BadRequestError("the header Idempotency-Key and the field key differ; give one of them")
     book = call.manager.book
     is_known = bool(key) and book.with_key(call.request.user, key) is not None
-    if book.open_count >= MOST_OPEN and not is_known:
-        return problem(429, f"there are {MOST_OPEN} open tasks; wait until some have ended")
+    if not is_known and (refusal := _refuse_more(call)):
+        return problem(429, refusal)
     before = book.number
     task = book.create(read_order(model), call.now, user=call.request.user, key=key)
     is_new = book.number != before
@@ -45,11 +57,7 @@ async def create(call: Call) -> FleetAnswer:
 async def listed(call: Call) -> FleetAnswer:
     """Return a page of tasks."""
     call.only("state", "robot", "limit", "cursor", "order", "requester", "deadline_before")
-    states = {state for state in call.query.get("state", "").split(",") if state}
-    unknown = states - {state.value for state in TaskState} - {*_MORE_STATES}
-    if unknown:
-        possible = ", ".join([*(state.value for state in TaskState), *_MORE_STATES])
-        raise BadRequestError(f"unknown state {min(unknown)!r}; possible are {possible}")
+    states = _states(call)
     limit = call.count("limit", 100, 1000) or 100
     before = call.number("deadline_before", None)
     found: list[Task] = []
@@ -91,6 +99,27 @@ async def cancel(call: Call) -> FleetAnswer:
     task = call.manager.book.cancel(call.names[0], call.now, user=call.request.user, revision=call.revision())
     await call.manager.commit()
     return _answer(call, task)
+
+
+async def cancel_many(call: Call) -> FleetAnswer:
+    """Cancel tasks of a requester, of a robot or in some states: the oldest first, so many at once."""
+    call.only("state", "robot", "requester", "limit")
+    if not any(call.query.get(name) for name in ("state", "robot", "requester")):
+        raise BadRequestError("give state, robot or requester: state=open cancels all that have not ended")
+    if call.revision() is not None:
+        raise BadRequestError("If-Match is for one task: leave it out")
+    limit = call.count("limit", MOST_CANCELLED, MOST_CANCELLED) or MOST_CANCELLED
+    manager, user = call.manager, call.request.user
+    tasks = (manager.book.tasks[number] for number in manager.book.numbers(_states(call)))
+    names = [task.id for task in tasks if task.can_be_cancelled and _fits(task, call.query)]
+    cancelled: list[str] = []
+    for begin in range(0, min(limit, len(names)), _AT_ONCE):
+        for name in names[begin : min(begin + _AT_ONCE, limit)]:
+            if _can_be_cancelled(call, name):  # it may have ended, or was cancelled, meanwhile
+                manager.book.cancel(name, manager.clock(), user=user)
+                cancelled.append(name)
+        await manager.commit()
+    return shown(CancelledTasks(tasks=cancelled, left=max(0, len(names) - limit)))
 
 
 async def hold(call: Call) -> FleetAnswer:
@@ -145,6 +174,7 @@ async def load(call: Call) -> FleetAnswer:
 ROUTES = [
     Route("POST", "/tasks", create, changes=True),
     Route("GET", "/tasks", listed),
+    Route("DELETE", "/tasks", cancel_many, changes=True),
     Route("GET", "/tasks/{id}", read),
     Route("PATCH", "/tasks/{id}", change, changes=True),
     Route("DELETE", "/tasks/{id}", cancel, changes=True),
@@ -154,6 +184,40 @@ ROUTES = [
     Route("POST", "/tasks/{id}/confirm", confirm, changes=True),
     Route("POST", "/tasks/{id}/load", load, changes=True),
 ]
+
+
+def _refuse_more(call: Call) -> str:
+    """Return why no more tasks are accepted from the requester now; empty: they are."""
+    book, user = call.manager.book, call.request.user
+    if book.open_count >= MOST_OPEN:
+        return f"there are {MOST_OPEN} open tasks; wait until some have ended"
+    if user and book.open_count_of(user) >= MOST_OF_ONE:
+        return (
+            f"{user} has {MOST_OF_ONE} open tasks, the most of one requester; wait until some have ended, or"
+            " cancel them (DELETE /tasks?requester=...)"
+        )
+    return ""
+
+
+def _states(call: Call) -> set[str]:
+    """Return the states that the query names.
+
+    Raises:
+        BadRequestError: One of them is unknown.
+    """
+    states = {state for state in call.query.get("state", "").split(",") if state}
+    unknown = states - {state.value for state in TaskState} - {*_MORE_STATES}
+    if unknown:
+        possible = ", ".join([*(state.value for state in TaskState), *_MORE_STATES])
+        raise BadRequestError(f"unknown state {min(unknown)!r}; possible are {possible}")
+    return states
+
+
+def _can_be_cancelled(call: Call, name: str) -> bool:
+    try:
+        return call.manager.book.find(name).can_be_cancelled
+    except UnknownTaskError:
+        return False  # it was forgotten
 
 
 def _numbers(call: Call, states: set[str]) -> list[int]:

@@ -27,6 +27,7 @@ from rce_fleet.api.fleet import (
     ZoneRequest,
 )
 from rce_fleet.api.tasks import (
+    CancelledTasks,
     HoldRequest,
     LoadRequest,
     PutInRequest,
@@ -59,6 +60,11 @@ _UNKNOWN_OUTCOME = (
 )
 _CURSOR = Query(name="cursor", description="The field next of the page before.")
 _LIMIT = Query(name="limit", description="Most in one answer.", type="integer")
+_WHICH_TASKS = (
+    Query(name="state", description="States, separated by commas; also open, ended and recurring."),
+    Query(name="robot", description="The robot that does them."),
+    Query(name="requester", description="Who created them."),
+)
 
 
 def role_of(user: StationUser) -> str:
@@ -107,7 +113,7 @@ class FleetRequests:
             request: The request.
             action: What it does, for the audit log; empty: it only reads.
         """
-        subject = request.rel_url.raw_path.removeprefix(PREFIX)[:MAX_SUBJECT]
+        subject = _target(request)[:MAX_SUBJECT]
         given = {name: request.headers.get(name, "") if action else "" for name in (_KEY, hdrs.IF_MATCH)}
         for name, text in given.items():
             if len(text) > MAX_KEY or not text.isprintable():
@@ -234,9 +240,7 @@ ROUTES: list[Route[str]] = [
         *("GET", "/tasks", "", "List tasks, by growing number"),
         reply=TaskPage,
         query=(
-            Query(name="state", description="States, separated by commas; also open, ended and recurring."),
-            Query(name="robot", description="The robot that does them."),
-            Query(name="requester", description="Who created them."),
+            *_WHICH_TASKS,
             Query(
                 name="deadline_before",
                 description="Only those with a deadline before this time, seconds since 1970.",
@@ -245,6 +249,19 @@ ROUTES: list[Route[str]] = [
             Query(name="order", description="asc (default) or desc."),
             _CURSOR,
             _LIMIT,
+        ),
+    ),
+    _route(
+        *(
+            "DELETE",
+            "/tasks",
+            "cancel_tasks",
+            "Cancel many tasks, the oldest first: of some states, of a robot or of a user",
+        ),
+        reply=CancelledTasks,
+        query=(
+            *_WHICH_TASKS,
+            Query(name="limit", description="1000 at most, and by default.", type="integer"),
         ),
     ),
     _route("GET", "/tasks/{id}", "", "Return a task", reply=TaskModel, name="get_task"),

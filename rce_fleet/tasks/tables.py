@@ -64,6 +64,8 @@ class FleetTables:
         self.number = 0
         self.last_task = 0
         self._open: dict[int, None] = {}
+        self._open_of: Counter[str] = Counter()
+        """How many open tasks a requester has."""
         self._by_state: dict[TaskState, dict[int, None]] = {state: {} for state in TaskState}
         self._recurring: dict[int, None] = {}
         """Tasks of which another occurrence follows, ended or not."""
@@ -151,6 +153,10 @@ class FleetTables:
     def open_count(self) -> int:
         """How many tasks have not ended."""
         return len(self._open)
+
+    def open_count_of(self, requester: str) -> int:
+        """Return how many tasks of a requester have not ended."""
+        return self._open_of[requester]
 
     def open_tasks(self) -> Iterator[Task]:
         """Return the tasks that have not ended, oldest first."""
@@ -259,6 +265,7 @@ class FleetTables:
             self._open.pop(task.number, None)
         else:
             self._open[task.number] = None
+            self._open_of[task.requester] += 1
             self._used_cells.update(task.order.cells())
         self._by_state[task.state][task.number] = None
         if task.recurs_at is None:
@@ -273,10 +280,13 @@ class FleetTables:
             self._queues.setdefault(task.robot, {})[task.number] = None
 
     def _leave_indexes(self, before: Task) -> None:
-        """Remove a task's former record from the indexes by state and cell."""
+        """Remove a task's former record from the indexes by state, requester and cell."""
         number = before.number
         self._by_state[before.state].pop(number, None)
         if not before.has_ended:
+            self._open_of[before.requester] -= 1
+            if not self._open_of[before.requester]:
+                del self._open_of[before.requester]
             for cell in before.order.cells():
                 self._used_cells[cell] -= 1
                 if not self._used_cells[cell]:

@@ -207,6 +207,11 @@ class Task:
         return self.state in ENDED
 
     @property
+    def can_be_cancelled(self) -> bool:
+        """Whether a cancel changes it: it is open and was not cancelled, or another occurrence follows."""
+        return self.recurs_at is not None if self.has_ended else self.state is not TaskState.CANCELLING
+
+    @property
     def is_loaded(self) -> bool:
         """Whether a robot carries a load for it."""
         return self.loads > 0

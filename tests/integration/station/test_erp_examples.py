@@ -72,7 +72,7 @@ async def check_commands(url: str, folder: Path) -> None:
     lines = [
         line[2:] for line in block("console", "$ rce fleet").splitlines() if line.startswith("$ rce fleet")
     ]
-    assert len(lines) == 24
+    assert len(lines) == 25
     said = {}
     for line in lines:
         words = [waiting if word == "T1" else word for word in shlex.split(line.partition(" > ")[0])]
@@ -83,6 +83,7 @@ async def check_commands(url: str, folder: Path) -> None:
     assert re.fullmatch(r"T[0-9]+\n", said["task add"])
     assert waiting in next(text for words, text in said.items() if words.startswith("tasks"))
     assert said["task hold"] == f"{waiting} is held\n"
+    assert said["task cancel-many"].endswith(" tasks are cancelled, or bring their loads away first\n")
     assert "Robot1" in next(text for words, text in said.items() if words.startswith("robots"))
     assert "out" in said["take-out Robot2"]
     assert "paused" in said["pause --all"]

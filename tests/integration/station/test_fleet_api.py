@@ -243,6 +243,12 @@ async def check_client(fleet: ManagedFleet) -> None:
         assert (await client.hold_task(task.id, "wait for the truck")).state == "held"
         assert (await client.resume_task(task.id)).state == "queued"
         assert (await client.cancel_task(task.id)).state == "cancelled"
+        held = [await client.create_task(later, key=f"held {number}") for number in range(2)]
+        for task in held:
+            await client.hold_task(task.id)
+        assert {task.id for task in held} <= {*await client.cancel_tasks(state=["held"])}
+        with pytest.raises(ValueError, match="give state, robot or requester"):
+            await client.cancel_tasks()
         with pytest.raises(NotFoundError, match="T77777"):
             await client.task("T77777")
         with pytest.raises(ApiError, match="cell"):

@@ -97,6 +97,26 @@ async def test_a_zone_that_was_removed_without_an_answer_is_removed(is_first: bo
     assert asked == (1 if is_first else 3)
 
 
+async def test_rce_fleet_cancels_many_tasks() -> None:
+    """It asks again until none is left."""
+    left, asked = [2, 0], list[tuple[str, dict[str, str]]]()
+
+    async def cancel(request: web.Request) -> web.Response:
+        asked.append((f"{request.method} {request.path}", dict(request.query)))
+        return web.json_response({"tasks": ["T7", "T8"], "left": left.pop(0)})
+
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", cancel)
+    words = ["task", "cancel-many", "--requester", "erp", "--state", "queued,held"]
+    async with TestServer(app) as server:
+        words += ["--station", str(server.make_url("/"))]
+        found = await asyncio.to_thread(CliRunner().invoke, commands, words)
+    assert (found.exit_code, found.output) == (0, "4 tasks are cancelled, or bring their loads away first\n")
+    assert asked == [("DELETE /api/v1/tasks", {"requester": "erp", "state": "queued,held"})] * 2
+    found = CliRunner().invoke(commands, ["task", "cancel-many", "--station", NOTHING])
+    assert (found.exit_code, "say which tasks: --requester USER" in found.output) == (2, True)
+
+
 @pytest.mark.parametrize("key", [" 4711", "order\n4711", "Auftrag 4711 für Jürgen"])
 async def test_a_task_is_created_with_any_key(key: str) -> None:
     """In a header the first was refused as another one than that of the task, and the second failed."""

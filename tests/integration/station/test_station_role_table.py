@@ -54,6 +54,7 @@ OPERATORS = {
     "POST /simulation",
     "POST /masters/kill-leader",
     "POST /tasks",
+    "DELETE /tasks",
     "PATCH /tasks/{id}",
     "DELETE /tasks/{id}",
     "POST /tasks/{id}/hold",

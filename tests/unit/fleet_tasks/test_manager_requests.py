@@ -270,6 +270,68 @@ async def test_a_known_key_gives_its_task_also_with_too_many_open_tasks(
     assert (await client.ask("POST", "/tasks", GO, key="order-3"))[0] == 201
 
 
+async def test_one_requester_leaves_room_for_others(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program in a loop without keys made all tasks that can be open, and other users were refused."""
+    monkeypatch.setattr(task_routes, "MOST_OPEN", 3)
+    monkeypatch.setattr(task_routes, "MOST_OF_ONE", 2)
+    for _ in range(2):
+        assert (await client.ask("POST", "/tasks", GO))[0] == 201
+    status, body, _ = await client.ask("POST", "/tasks", GO)
+    assert (status, "erp has 2 open tasks" in body["error"]) == (429, True)
+    assert (await client.ask("POST", "/tasks", GO, user="bob"))[0] == 201
+    status, body, _ = await client.ask("POST", "/tasks", GO, user="bob")
+    assert (status, "there are 3 open tasks" in body["error"]) == (429, True)
+    client.manager._reload()
+    assert client.manager.book.open_count_of("erp") == 2
+    await client.ask("DELETE", "/tasks/T2")
+    assert (await client.ask("POST", "/tasks", GO))[0] == 201
+
+
+async def test_many_tasks_are_cancelled_at_once(client: ManagerClient) -> None:
+    """As each of them by itself: with an event of each, and the load of one brought away."""
+    for user in ("erp", "bob", "erp", "erp", "erp"):
+        await client.ask("POST", "/tasks", GO, user=user)
+    await client.ask("POST", "/tasks", {"stops": [{"cell": 5}], "repeat": {"every": 60}})
+    book = client.manager.book
+    book.put_record(replace(book.find("T3"), robot="Robot1", loads=1, state=TaskState.RUNNING))
+    book.emit(replace(book.find("T4"), state=TaskState.DONE), "finished", 0.0)
+    book.emit(replace(book.find("T6"), state=TaskState.DONE), "finished", 0.0)
+    assert (await client.ask("DELETE", "/tasks?requester=erp&state=queued&limit=1"))[:2] == (
+        200,
+        {"tasks": ["T1"], "left": 1},
+    )
+    answer = {"tasks": ["T3", "T5", "T6"], "left": 0}
+    assert (await client.ask("DELETE", "/tasks?requester=erp", user="ann"))[:2] == (200, answer)
+    states = [task["state"] for task in (await client.ask("GET", "/tasks"))[1]["tasks"]]
+    assert states == ["cancelled", "queued", "cancelling", "done", "cancelled", "done"]
+    events = (await client.ask("GET", "/events?kind=task"))[1]["events"]
+    done = [(event["id"], event["name"]) for event in events if event["user"] == "ann"]
+    assert done == [("T3", "cancelling"), ("T5", "cancelled"), ("T6", "recurrence ended")]
+    assert (await client.ask("DELETE", "/tasks?requester=erp"))[1] == {"tasks": [], "left": 0}
+
+
+@pytest.mark.parametrize(
+    ("query", "fields", "status", "text"),
+    [
+        ("", {}, 422, "give state, robot or requester"),
+        ("?state=&requester=", {}, 422, "give state, robot or requester"),
+        ("?state=late", {}, 422, "unknown state 'late'"),
+        ("?colour=red", {}, 422, "unknown parameter 'colour'"),
+        ("?state=open", {"revision": '"1"'}, 422, "If-Match is for one task"),
+        ("?state=open", {"role": "viewer"}, 403, "may not change anything"),
+    ],
+)
+async def test_many_tasks_are_not_cancelled_by_mistake(
+    client: ManagerClient, query: str, fields: dict[str, str], status: int, text: str
+) -> None:
+    await client.ask("POST", "/tasks", GO)
+    said, body, _ = await client.ask("DELETE", f"/tasks{query}", **fields)
+    assert (said, text in body["error"]) == (status, True), body
+    assert (await client.ask("GET", "/tasks/T1"))[1]["state"] == "queued"
+
+
 @pytest.mark.parametrize("order", ["DESC", "newest", ""])
 async def test_an_unknown_order_of_tasks_is_refused(client: ManagerClient, order: str) -> None:
     """It was taken for ascending."""
