@@ -3,8 +3,9 @@
 An answer is a ``std_msgs/Int32MultiArray`` with three parts, one for each dimension: the list's cells; the
 last cell reached and the one driven to, -1 for none; and cells that the robot has found blocked. The label of
 the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels.
-The label of the second tells of the robot: ``robot_age=0.2 pose=1.5,2.5,0.0``, each only if it is known. A
-fourth part, cells that the robot saw free again, is there only if there are such cells.
+The label of the second tells of the robot: ``robot_age=0.2 pose=1.5,2.5,0.0``, and of the planner that sent
+the list: ``planner=1790000000.000000000``, each only if it is known. A fourth part, cells that the robot saw
+free again, is there only if there are such cells.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _MARK = "answer="
 _NUMBER = "revision="
 _GRID = "grid="
 _SPEED = "speed="
+_PLANNER = "planner="
 _AGE = "robot_age="
 _POSE = "pose="
 _NONE = -1
@@ -40,6 +42,8 @@ class Answer(NamedTuple):
     """Cells that the robot has seen free again."""
     sign: RobotSign = NO_SIGN
     """What the move client last heard of the robot."""
+    planner: str = ""
+    """Name of the planner that sent the list: when it began; empty: the list did not say it."""
 
 
 def is_answer(labels: Sequence[str]) -> bool:
@@ -53,7 +57,7 @@ def answer_array(answer: Answer) -> dict[str, Any]:
     progress = [_NONE if cell is None else cell for cell in (report.reached, report.target)]
     parts = {
         f"{_MARK}{report.revision} {report.state.value}": list(report.cells),
-        _sign_label(answer.sign): progress,
+        _label(answer): progress,
         "blocked": list(answer.blocked),
     }
     if answer.freed:
@@ -82,7 +86,8 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     cells, progress, blocked, *rest = (tuple(data[begin:end]) for begin, end in pairwise(ends))
     reached, target = (None if cell == _NONE else cell for cell in progress)
     report = ClientReport(read_revision(int(revision)), read_client_state(state), cells, reached, target)
-    return Answer(report, blocked, rest[0] if rest else (), _read_sign(labels[1]))
+    freed = rest[0] if rest else ()
+    return Answer(report, blocked, freed, _read_sign(labels[1]), _word(labels[1], _PLANNER))
 
 
 def read_client_state(text: str) -> ClientState:
@@ -108,12 +113,15 @@ def read_revision(revision: int) -> int:
     return revision
 
 
-def _sign_label(sign: RobotSign) -> str:
+def _label(answer: Answer) -> str:
+    sign = answer.sign
     words = ["reached and target"]
     if sign.age is not None:
         words.append(f"{_AGE}{sign.age!r}")
     if sign.pose is not None:
         words.append(_POSE + ",".join(map(repr, sign.pose)))
+    if answer.planner:
+        words.append(_PLANNER + answer.planner)
     return " ".join(words)
 
 
@@ -134,7 +142,14 @@ def _read_sign(label: str) -> RobotSign:
     return RobotSign(age, pose)
 
 
-def numbered_array(cells: Sequence[int], revision: int, grid: str = "", speed: float = inf) -> dict[str, Any]:
+def _word(label: str, mark: str) -> str:
+    """Return what follows a mark in a label; empty without it."""
+    return next((word.removeprefix(mark) for word in label.split() if word.startswith(mark)), "")
+
+
+def numbered_array(
+    cells: Sequence[int], revision: int, grid: str = "", speed: float = inf, planner: str = ""
+) -> dict[str, Any]:
     """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells.
 
     Args:
@@ -142,18 +157,26 @@ def numbered_array(cells: Sequence[int], revision: int, grid: str = "", speed: f
         revision: Number of the list.
         grid: Names the grid that the cells belong to; empty: not said.
         speed: Greatest speed in the cells, metres per second; infinity: not limited.
+        planner: Names the planner that sends it; empty: not said.
     """
     dimensions = [{"label": f"{_NUMBER}{revision}", "size": len(cells), "stride": len(cells)}]
     if grid:
         dimensions.append({"label": f"{_GRID}{grid}", "size": 0, "stride": 0})
     if speed < inf:
         dimensions.append({"label": f"{_SPEED}{speed!r}", "size": 0, "stride": 0})
+    if planner:
+        dimensions.append({"label": f"{_PLANNER}{planner}", "size": 0, "stride": 0})
     return {"layout": {"dim": dimensions, "data_offset": 0}, "data": list(cells)}
 
 
 def grid_of(labels: Sequence[str]) -> str:
     """Return the grid that a list belongs to; empty if it does not say."""
     return next((label.removeprefix(_GRID) for label in labels if label.startswith(_GRID)), "")
+
+
+def planner_of(labels: Sequence[str]) -> str:
+    """Return the planner that sent a list; empty if it does not say."""
+    return next((label.removeprefix(_PLANNER) for label in labels if label.startswith(_PLANNER)), "")
 
 
 def speed_of(labels: Sequence[str]) -> float:

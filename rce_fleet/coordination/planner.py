@@ -63,6 +63,11 @@ _AT_ONCE = frozenset({CellBlocked, ModeSet, ObstacleSeen, ZonesSet})
 """Events after which the robots concerned get new paths before the next tick: their ways are cut."""
 
 
+EARLIER_LIST = "its move client knows an earlier planner"
+FOREIGN_LIST = "its move client took a list of another planner or program: end that one"
+"""Why a robot is stopped whose move client had taken a list of this planner before."""
+
+
 class FleetPlanner:
     """Plans for a fleet on a grid, and grants cells to its robots.
 
@@ -215,7 +220,7 @@ class FleetPlanner:
                 self._dispatcher.watch(record)
         if report.revision > record.revision:
             record.revision = report.revision
-            self._dispatcher.hold(record, "its move client knows an earlier planner")
+            self._dispatcher.hold(record, FOREIGN_LIST if record.took_list else EARLIER_LIST)
         elif known is not None and report.revision < known.revision:
             if record.phase is Phase.ACTIVE:
                 self._dispatcher.hold(record, "its move client was restarted")

@@ -106,6 +106,7 @@ class RobotRecord:
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
         sent_again: How often it was sent the same cells again since it moved.
+        took_list: Whether its move client has taken a list of this planner.
         pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
         jumped_at: When a pose came that cannot be true.
         doubted: Cells that it overlapped before such poses; it may be there still, until it is placed.
@@ -140,6 +141,7 @@ class RobotRecord:
     held_at: float = -inf
     sent_at: float = -inf
     sent_again: int = 0
+    took_list: bool = False
     pose_only: bool = False
     jumped_at: float = -inf
     doubted: frozenset[int] = frozenset()
@@ -205,6 +207,7 @@ class RobotRecord:
         """Update the move client's report."""
         self.report, self.reported_at, self.pose_only = report, now, False
         self.earlier = frozenset()
+        self.took_list |= report.revision == self.revision
         if report.revision != self.revision or report.state not in (ClientState.IDLE, ClientState.FAILED):
             self.obeyed_at = inf
         elif self.obeyed_at == inf:

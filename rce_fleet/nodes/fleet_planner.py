@@ -35,6 +35,7 @@ from rce_fleet.coordination.events import (
 )
 from rce_fleet.coordination.grid_change import next_planner, refuse_grid
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.planner_watch import OtherPlanner, PlannerWatch
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import LanesError, MapError, PlannerError, ZoneError
 from rce_fleet.nodes.block_messages import read_cell_request
@@ -67,6 +68,9 @@ KEEP_EVERY = 1.0
 """Seconds between two looks whether robots have other cells than those kept for the next planner."""
 SERVICE = "/fleet/set_goal"
 """Every planner provides this service."""
+STOPPED = "%s: this planner has stopped; end one of the two, then start this one again"
+REMIND_EVERY = 60.0
+"""Seconds after which a planner that stopped because of another one says so again."""
 BAD_PARAMETERS = 2
 """Exit code of a planner that cannot start with its parameters."""
 GRID_OF_LANES = (
@@ -88,6 +92,7 @@ class PlannerNode:
 
     Attributes:
         successor: The node of another planner that has taken over; empty: none has.
+        other: A newer planner in another ROS graph, which drives robots of this one; None: not found.
     """
 
     def __init__(
@@ -106,11 +111,22 @@ class PlannerNode:
         self._requests: asyncio.Queue[tuple[FleetPlanner, PlanRequest]] = asyncio.Queue()
         self._state = StatePublisher(node, planner)
         self._poses = PosePublisher(node)
-        self._robots = RobotTopics(node, self._handle, self._poses, takes_answers=takes_answers)
+        self._watch = PlannerWatch(grid_name(self._state.started))
+        self._robots = RobotTopics(
+            *(node, self._handle, self._poses),
+            takes_answers=takes_answers,
+            hear_planner=self._hear_planner,
+        )
         self._grid = GridTopics(node)
         self._known = known
         self._throttled_log = ThrottledLog(node)
         self.successor = ""
+        self.other: OtherPlanner | None = None
+
+    @property
+    def is_replaced(self) -> bool:
+        """Whether another planner drives the fleet now."""
+        return bool(self.successor) or self.other is not None
 
     async def run(self, blocked: list[int]) -> None:
         """Run until the node is stopped, or another planner has taken over.
@@ -143,6 +159,8 @@ class PlannerNode:
             gc.freeze()
             collect_all_seldom()
             await self._keep_time(worker)
+            if self.other is not None:
+                self._stop_own()
             planning.cancel()
 
     # Robots
@@ -173,7 +191,7 @@ class PlannerNode:
 
     async def _keep_known(self) -> None:
         """Write the robots and their cells, if they changed, beside the planner's work."""
-        while self._known is not None and not self.successor and await self._node.sleep(KEEP_EVERY):
+        while self._known is not None and not self.is_replaced and await self._node.sleep(KEEP_EVERY):
             content = self._known.content(self._planner.state, uptime())
             if content is None:
                 continue
@@ -189,7 +207,7 @@ class PlannerNode:
                 try:
                     topics = await graph.look()
                     self.successor = successor(self._node, topics, SERVICE)
-                    if self.successor:
+                    if self.is_replaced:
                         return
                     found = filter(None, map(ROBOT_TOPIC.fullmatch, topics.publishers))
                     await self._robots.join(robot[1] for robot in found if robot[1] not in self._robots)
@@ -199,10 +217,28 @@ class PlannerNode:
                 if not await self._node.sleep(graph.pause):
                     return
 
+    def _hear_planner(self, robot: str, planner: str) -> None:
+        """Take the planner that a move client reports; one that is newer than this one replaces it."""
+        other = self._watch.take(robot, planner, time.monotonic())
+        if other is None:
+            return
+        if other.is_newer:
+            self.other = other
+        else:
+            text = f"{describe(other)}; it is the older one and should stop by itself: if it does not, end it"
+            self._throttled_log.warn("planner", text)
+
+    def _stop_own(self) -> None:
+        """Stop the robots that the other planner does not drive: it does not know which cells they have."""
+        for robot in self._planner.state.robots:
+            if not self._watch.is_with_other(robot):
+                self._robots.send_cancel(robot)
+        self._robots.fall_silent()
+
     # What comes in
 
     async def _keep_time(self, worker: PlanWorker) -> None:
-        while not self.successor and await self._node.sleep(TICK):
+        while await self._node.sleep(TICK) and not self.is_replaced:
             if self._planner.settings.planner != INDEPENDENT:  # that one asks for a plan after deadlocks only
                 robots = max(len(self._planner.state.robots), len(self._planner.expected))
                 worker.prepare(robots, len(self._planner.state.grid))
@@ -278,6 +314,7 @@ class PlannerNode:
         self._robots.ignore_old_cells()
         self._chooser.blocked_share = choice.blocked_share
         self._state.restart(self._planner)
+        self._watch.rename(grid_name(self._state.started))
         self._publish_blocked(tuple(sorted(self._planner.state.blocked)))
         self._carry_out(instructions)
         self._state.publish_whole()
@@ -321,6 +358,24 @@ class PlannerNode:
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._grid.publish(self._planner.state, self._state.started, cells)
+
+
+def describe(other: OtherPlanner) -> str:
+    """Return which planner drives a robot of this one, for people."""
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(other.began))
+    name = f"it began at {began}, {other.name}"
+    return f"another planner, in another ROS graph, drives {other.robot} too ({name})"
+
+
+async def stay_away(other: OtherPlanner) -> int:
+    """Do nothing until the node is stopped, and say why again and again; return the exit code.
+
+    A planner that began again would be the newer one: then the other would stop, and so on.
+    """
+    async with Node("fleet_planner") as node:
+        while await node.sleep(REMIND_EVERY):
+            node.log.error(STOPPED, describe(other))
+    return 0
 
 
 def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
@@ -380,12 +435,15 @@ async def serve() -> int | None:
         made = FleetPlanner(grid, settings, lanes=lanes)
         planner = PlannerNode(node, made, chooser, takes_answers=takes_answers, known=kept)
         await planner.run(blocked)
-        if not planner.successor:
+        if node.is_shutdown or not planner.is_replaced:
             return 0
-        node.log.error(
-            "the planner %s has taken over this fleet: this one stops, and stands by", planner.successor
-        )
-    return None
+        if planner.other is not None:
+            node.log.error(STOPPED, describe(planner.other))
+        else:
+            node.log.error(
+                "the planner %s has taken over this fleet: this one stops, and stands by", planner.successor
+            )
+    return None if planner.other is None else await stay_away(planner.other)
 
 
 if __name__ == "__main__":

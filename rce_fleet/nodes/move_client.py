@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any, assert_never
 from rce.ros.node import MasterError, Message, Node, Publisher, Time, run
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.coordination.answers import Answer, answer_array, grid_of, is_answer, revision_of, speed_of
+from rce_fleet.coordination.answers import (
+    Answer,
+    answer_array,
+    grid_of,
+    is_answer,
+    planner_of,
+    revision_of,
+    speed_of,
+)
 from rce_fleet.coordination.move_client import (
     ClientReport,
     ClientState,
@@ -78,6 +86,8 @@ class MoveClientNode:
         self._answers = False
         self._hears_old = False
         self._grid = Time()
+        self._planner = ""
+        """The planner that sent the newest list."""
         self._signs = RobotSigns()
         self._throttled_log = ThrottledLog(node)
         self._alive_topic = ""
@@ -212,6 +222,8 @@ class MoveClientNode:
             self._node.log.debug("cells of another grid are ignored; they are sent again")
             return
         revision = revision_of(labels)
+        if revision is not None and revision > self._client.report.revision:
+            self._planner = planner_of(labels)
         self._limit_speed(speed_of(labels))
         try:
             self._do(self._client.take_cells(revision, list(message.data), self._node.time()))
@@ -305,7 +317,7 @@ class MoveClientNode:
             self._reported, self._progressed_at = report, self._reported_at
         sign = self._signs.sign(time.monotonic(), is_driving=report.state is ClientState.DRIVING)
         if self._answers:
-            self._reports.publish(answer_array(Answer(report, blocked, freed, sign)))
+            self._reports.publish(answer_array(Answer(report, blocked, freed, sign, self._planner)))
             return
         self._reports.publish(
             revision=report.revision,

@@ -38,18 +38,27 @@ class RobotTopics:
         take: Passes an event to the planner.
         poses: Publishes the poses of all robots.
         takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
+        hear_planner: Called with a robot and the planner whose grid or list its move client took last; empty:
+            not told.
 
     Attributes:
         client_grids: The grid that each robot's move client has; empty: it has one from its parameters.
     """
 
     def __init__(
-        self, node: Node, take: Callable[[Event], object], poses: PosePublisher, *, takes_answers: bool
+        self,
+        node: Node,
+        take: Callable[[Event], object],
+        poses: PosePublisher,
+        *,
+        takes_answers: bool,
+        hear_planner: Callable[[str, str], object],
     ) -> None:
         self._node = node
         self._take = take
         self._poses = poses
         self._takes_answers = takes_answers
+        self._hear_planner = hear_planner
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
         self._joined: set[str] = set()
@@ -62,21 +71,27 @@ class RobotTopics:
         return robot in self._joined
 
     def send_cells(self, instruction: SendCells, grid: str) -> None:
-        """Send a robot its cells, which belong to a grid of this name.
+        """Send a robot its cells, which belong to a grid of this name; it is the planner's name too.
 
         A robot that an earlier planner knew may not be connected yet: its list is sent again.
         """
         publisher = self._cells.get(instruction.robot)
         if publisher is not None:
-            named = "" if self._takes_answers else grid
-            fields = numbered_array(instruction.cells, instruction.revision, named, instruction.speed)
-            publisher.publish(fields)
+            # Move clients that answer have their grid from parameters: to them its name says nothing.
+            named, planner = ("", grid) if self._takes_answers else (grid, "")
+            cells, revision, speed = instruction.cells, instruction.revision, instruction.speed
+            publisher.publish(numbered_array(cells, revision, named, speed, planner))
 
     def send_cancel(self, robot: str) -> None:
         """Stop a robot."""
         publisher = self._cancels.get(robot)
         if publisher is not None:
             publisher.publish(data=True)
+
+    def fall_silent(self) -> None:
+        """Send robots nothing from now on."""
+        self._cells.clear()
+        self._cancels.clear()
 
     def ignore_old_cells(self) -> None:
         """Take no cells from robots for a while, because they may be of the grid before."""
@@ -159,6 +174,7 @@ class RobotTopics:
         except ValueError as error:
             self._warn_of_report(robot, error)
             return
+        self._hear_planner(robot, answer.planner)
         self._take_report(robot, answer.report, answer.sign)
         if answer.blocked:
             self._take(ObstacleSeen(robot, answer.blocked))
@@ -172,6 +188,7 @@ class RobotTopics:
             self._warn_of_report(robot, error)
             return
         self.client_grids[robot] = grid_name(message.grid)
+        self._hear_planner(robot, self.client_grids[robot])
         self._take_report(robot, report, read_sign(message))
 
     def _warn_of_report(self, robot: str, error: ValueError) -> None:

@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 from contextlib import AsyncExitStack
+from functools import partial
 from math import hypot
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from support.resting_robot import PACKAGES, fleet_program
 from rce.ros.core import Core
 from rce.ros.node import Node, Publisher, RosError
 from rce.ros.node.master import MasterClient
-from rce.ros.types import Message, TypeRegistry
+from rce.ros.types import Message, Time, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
 SPEED, STEP, POSE_EVERY = 1.0, 0.05, 0.2
@@ -114,6 +115,8 @@ class Judge:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._heard: asyncio.Queue[str] = asyncio.Queue()
+        self.stopped: list[str] = []
+        """Robots that were told to stop."""
 
     @classmethod
     async def start(cls, stack: AsyncExitStack, core: Core) -> Judge:
@@ -141,6 +144,37 @@ class Judge:
                 except RosError:
                     await asyncio.sleep(0.2)
 
+    async def show_newer_planner(self, own: Time) -> None:
+        """Be two robots, one of which gets the grid of a newer planner each time after the grid of this one.
+
+        Args:
+            own: When the planner of this ROS graph began.
+        """
+        node, reports = self._node, dict[str, Publisher]()
+        fields: dict[str, Any] = {"state": "idle", "reached": -1, "target": -1}
+        async with asyncio.timeout(90):
+            for robot in ("Robot1", "Robot2"):
+                await node.advertise(f"/{robot}/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")
+                reports[robot] = await node.advertise(f"/{robot}/moveClient/status", "fleet/MoveStatus")
+                lists = await node.subscribe(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
+                take = partial(self._take_stop, robot)
+                stops = await node.subscribe(f"/{robot}/cancelGoal", "std_msgs/Bool", take)
+                await stops.wait_for_publishers()
+                await lists.wait_for_publishers()
+                while not reports[robot].connections:
+                    await asyncio.sleep(0.05)
+                reports[robot].publish(**fields, grid=own)
+                label = (await anext(aiter(lists))).layout.dim[0].label
+                revision = int(label.removeprefix("revision="))
+                reports[robot].publish(**fields, grid=own, revision=revision)
+            self.stopped.clear()
+            for grid in (own, Time(own.secs + 100, 0)) * 2:
+                reports["Robot1"].publish(**fields, grid=grid, revision=revision)
+
+    def _take_stop(self, robot: str, message: Message) -> None:
+        assert message.data
+        self.stopped.append(robot)
+
     async def fill_backlog(self, service: str) -> None:
         """Connect to a hung program until it accepts no more connections."""
         async with RpcClient() as rpc:
@@ -160,6 +194,7 @@ def _continue(process: asyncio.subprocess.Process) -> None:
 
 
 async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
+    """Of two planners in two ROS graphs, the older one stops, with the robots that it alone drives."""
     async with Core(port=0) as core, AsyncExitStack() as stack:
         judge = await Judge.start(stack, core)
         first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py"))
@@ -169,7 +204,14 @@ async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
         assert await judge.planner_began() == before
         first.kill()
         await judge.hears("this one takes over")
-        assert await judge.planner_began() != before
+        began = await judge.planner_began()
+        assert began != before
+        await judge.show_newer_planner(began)
+        said = await judge.hears("/spare: another planner, in another ROS graph, drives Robot1 too")
+        assert "this planner has stopped; end one of the two" in said
+        async with asyncio.timeout(60):
+            while "Robot2" not in judge.stopped:
+                await asyncio.sleep(0.05)
 
 
 async def test_a_planner_that_was_hung_leaves_the_fleet_to_its_successor() -> None:

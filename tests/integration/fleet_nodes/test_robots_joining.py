@@ -31,7 +31,12 @@ async def planner(master_uri: str, take: list[Event]) -> AsyncIterator[tuple[Nod
     async with Node("planner", argv=[], master_uri=master_uri, types=types, signals=False) as node:
         poses = PosePublisher(node)
         await poses.start()
-        yield node, RobotTopics(node, take.append, poses, takes_answers=False)
+        yield (
+            node,
+            RobotTopics(
+                *(node, take.append, poses), takes_answers=False, hear_planner=lambda _robot, _planner: None
+            ),
+        )
 
 
 async def test_robots_are_joined_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:
