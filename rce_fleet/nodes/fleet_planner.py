@@ -50,14 +50,17 @@ from rce_fleet.nodes.planner_parameters import KNOWN, read_lane_graph, read_sett
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.standby import serve_in_turn, stand_by, successor
-from rce_fleet.nodes.state_publisher import StatePublisher
+from rce_fleet.nodes.state_publisher import GET_STATE, GET_STATE_SERVICE, StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.nodes.zone_messages import read_costs_set, read_mode_set, read_zones_set
 from rce_fleet.planning.planner import INDEPENDENT
 
 if TYPE_CHECKING:
+    from rce.ros.node import Service
+    from rce.ros.node.service import Handler
     from rce.ros.types import Message
     from rce_fleet.coordination.replanning import PlanRequest
+    from rce_fleet.nodes.graph_look import GraphState
     from rce_fleet.planning.grid import GridMap
 
 TICK = 0.1
@@ -119,6 +122,7 @@ class PlannerNode:
         )
         self._grid = GridTopics(node)
         self._known = known
+        self._services: dict[str, tuple[str, Handler, Service]] = {}
         self._throttled_log = ThrottledLog(node)
         self.successor = ""
         self.other: OtherPlanner | None = None
@@ -140,15 +144,16 @@ class PlannerNode:
         await self._expect_known()
         for cell in blocked:
             self._handle(CellBlocked(cell, reason="parameter of the planner"))
-        await node.advertise_service(SERVICE, "fleet/SetGoal", self._set_goal)
-        await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
-        await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
-        await node.advertise_service("/fleet/set_zones", "fleet/SetZones", self._set_zones)
-        await node.advertise_service("/fleet/set_costs", "fleet/SetCosts", self._set_costs)
-        await node.advertise_service("/fleet/set_mode", "fleet/SetMode", self._set_mode)
-        await node.advertise_service("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
+        await self._provide(SERVICE, "fleet/SetGoal", self._set_goal)
+        await self._provide("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
+        await self._provide("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        await self._provide("/fleet/set_zones", "fleet/SetZones", self._set_zones)
+        await self._provide("/fleet/set_costs", "fleet/SetCosts", self._set_costs)
+        await self._provide("/fleet/set_mode", "fleet/SetMode", self._set_mode)
+        await self._provide("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
         await self._poses.start()
         await self._state.start()  # last: who sees the state may call the services
+        self._services[GET_STATE_SERVICE] = GET_STATE, self._state.get_state, self._state.service
         timeout = self._planner.settings.plan_timeout
         async with PlanWorker(node.log, timeout=timeout) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
@@ -162,6 +167,20 @@ class PlannerNode:
             if self.other is not None:
                 self._stop_own()
             planning.cancel()
+
+    async def _provide(self, name: str, kind: str, answer: Handler) -> None:
+        self._services[name] = kind, answer, await self._node.advertise_service(name, kind, answer)
+
+    async def _provide_again(self, graph: GraphState) -> None:
+        """Take services back that are registered for another planner, which started at the same moment.
+
+        It stops, because this one has :data:`SERVICE`, and takes its registrations along.
+        """
+        own = self._node.name
+        for name, (kind, answer, service) in list(self._services.items()):
+            if own in graph.services.get(SERVICE, ()) and own not in graph.services.get(name, ()):
+                await service.close()
+                await self._provide(name, kind, answer)
 
     # Robots
 
@@ -209,6 +228,7 @@ class PlannerNode:
                     self.successor = successor(self._node, topics, SERVICE)
                     if self.is_replaced:
                         return
+                    await self._provide_again(topics)
                     found = filter(None, map(ROBOT_TOPIC.fullmatch, topics.publishers))
                     await self._robots.join(robot[1] for robot in found if robot[1] not in self._robots)
                     await self._grid.serve_old_topic(topics, self._planner.state, self._state.started)

@@ -16,7 +16,7 @@ from rce_fleet.nodes.block_messages import block_fields
 from rce_fleet.nodes.zone_messages import zone_fields
 
 if TYPE_CHECKING:
-    from rce.ros.node import Node, Publisher
+    from rce.ros.node import Node, Publisher, Service
     from rce_fleet.coordination.changes import FleetChanges
     from rce_fleet.coordination.planner import FleetPlanner
     from rce_fleet.coordination.snapshot import RobotSnapshot
@@ -41,7 +41,12 @@ class StatePublisher:
     Args:
         node: Running node.
         planner: The planner, with the state.
+
+    Attributes:
+        service: Returns the complete state, once :meth:`start` has been called.
     """
+
+    service: Service
 
     def __init__(self, node: Node, planner: FleetPlanner) -> None:
         self._node = node
@@ -56,7 +61,7 @@ class StatePublisher:
     async def start(self) -> None:
         """Advertise topics and service, and publish the current state."""
         node = self._node
-        await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self._get_state)
+        self.service = await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self.get_state)
         self._state = await node.advertise(STATE_TOPIC, STATE, latch=True)
         self._changes = await node.advertise(CHANGES_TOPIC, CHANGES)
         self.publish_whole()
@@ -88,7 +93,8 @@ class StatePublisher:
         """Publish the complete state now."""
         self._state.publish(state_fields(self._started, self._planner, time.monotonic()))
 
-    def _get_state(self, request: Message) -> dict[str, Any]:
+    def get_state(self, request: Message) -> dict[str, Any]:
+        """Answer a ``fleet/GetState`` request."""
         del request
         state = state_fields(self._started, self._planner, time.monotonic())
         return {"sequence": self._planner.sequence, "state": state}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
 
 from rce.ros.core import Core
-from rce.ros.node import Node
+from rce.ros.node import Node, RosError
 from rce.ros.types import Message
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.nodes import move_client
@@ -45,6 +46,25 @@ async def test_the_planner_publishes_its_grid() -> None:
         assert (info.origin.position.x, info.origin.position.y) == (1.0, 2.0)
         assert info.origin.orientation.z == pytest.approx(0.2474, abs=1e-4)
         assert [cell for cell, value in enumerate(message.data) if value] == [2, 5]
+
+
+async def test_a_service_that_another_planner_took_along_is_back() -> None:
+    """Of two that start together one stops, maybe after it has registered a service as the last one."""
+    async with (
+        Core(port=0) as core,
+        planning(core.uri),
+        Node("other", argv=[], master_uri=core.uri) as other,
+        asyncio.timeout(PATIENCE),
+    ):
+        await other.wait_for_service("/fleet/get_state")
+        taken = await other.advertise_service("/fleet/get_state", "fleet/GetState", lambda _: {})
+        await taken.close()
+        client, rows = other.service_client("/fleet/get_state", "fleet/GetState", persistent=False), 0
+        while not rows:
+            await asyncio.sleep(0.05)
+            with contextlib.suppress(RosError):
+                rows = (await client.call({}, timeout=PATIENCE)).state.rows
+        assert rows == GRID.rows
 
 
 async def test_a_flood_of_blocked_cells_is_published_together() -> None:
