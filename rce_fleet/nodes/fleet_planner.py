@@ -12,11 +12,13 @@ import gc
 import re
 import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.own_process import collect_all_seldom
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
+from rce.ros.node.running import stop_signals
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -387,14 +389,17 @@ def describe(other: OtherPlanner) -> str:
     return f"another planner, in another ROS graph, drives {other.robot} too ({name})"
 
 
-async def stay_away(other: OtherPlanner) -> int:
+async def stay_away(other: OtherPlanner, signals: list[str]) -> int:
     """Do nothing until the node is stopped, and say why again and again; return the exit code.
 
     A planner that began again would be the newer one: then the other would stop, and so on.
     """
+    told_at = time.monotonic()
     async with Node("fleet_planner") as node:
-        while await node.sleep(REMIND_EVERY):
-            node.log.error(STOPPED, describe(other))
+        while not signals and await node.sleep(1.0):  # one may come between two nodes
+            if time.monotonic() - told_at >= REMIND_EVERY:
+                told_at = time.monotonic()
+                node.log.error(STOPPED, describe(other))
     return 0
 
 
@@ -422,11 +427,17 @@ def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
 
 async def main() -> int:
     """Run the planner until the node is stopped; return the program's exit code."""
-    return await serve_in_turn(serve)
+    signals: list[str] = []
+    with stop_signals(signals.append):
+        return await serve_in_turn(partial(serve, signals))
 
 
-async def serve() -> int | None:
-    """Run the planner once; return the program's exit code, or None if another planner has taken over."""
+async def serve(signals: list[str]) -> int | None:
+    """Run the planner once; return the program's exit code, or None if another planner has taken over.
+
+    Args:
+        signals: Why the program shall end, once it shall.
+    """
     async with Node("fleet_planner") as node:
         values = await read_fleet_parameters(node)
         for remark in unknown_parameters(values, KNOWN):
@@ -463,7 +474,7 @@ async def serve() -> int | None:
             node.log.error(
                 "the planner %s has taken over this fleet: this one stops, and stands by", planner.successor
             )
-    return None if planner.other is None else await stay_away(planner.other)
+    return None if planner.other is None else await stay_away(planner.other, signals)
 
 
 if __name__ == "__main__":
