@@ -73,7 +73,7 @@ def test_any_failure_fails_the_run_and_nothing_runs_twice(
 
 
 def test_random_moments_are_as_many_as_asked() -> None:
-    argv = ["make", "--dry-run", "moments", "SEED=7", "COUNT=3"]
+    argv = ["make", "--dry-run", "--no-print-directory", "moments", "SEED=7", "COUNT=3"]
     done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "-m support.moments 7 3" in done.stdout.splitlines()[-1]

@@ -270,7 +270,7 @@ async def test_a_paused_fleet_offers_no_resume_of_a_robot(tmp_path: Path) -> Non
         client.manager.dispatcher.update(time.time(), client.manager.facts)
         paused = {**changes(robot("Robot1", cell=9, mode="paused")), "mode": "paused"}
         made.feed.on_change(made.view.on_changes(paused))
-        is_paused = "rceFleet.fleet.robots.get('Robot1').activity === 'paused'"
+        is_paused = "rceFleet.fleet.robots.get('Robot1')?.activity === 'paused'"
         await page.wait_for_function(is_paused)
         made.feed.on_change(made.view.on_changes({**changes(removed=["Robot1"]), "mode": "paused"}))
         await page.wait_for_function("!rceFleet.fleet.robots.has('Robot1')")
