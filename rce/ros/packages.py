@@ -22,7 +22,7 @@ An installed Python distribution adds packages and nodes by entry points; the pa
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import os
 import re
 import reprlib
@@ -51,6 +51,8 @@ MANIFESTS = ("package.yaml", "package.xml")
 
 ROSBUILD_MANIFEST = "manifest.xml"
 """The manifest of packages from before catkin, which gives no name: the folder's counts."""
+
+_log = logging.getLogger(__name__)
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _PYTHONS = ("engine", "system")
@@ -215,8 +217,10 @@ class PackageIndex:
     def look(self) -> None:
         """Search the folders, or check them for changes; an error is raised again by the look-up itself."""
         for root in self._searched():
-            with contextlib.suppress(Exception):
+            try:
                 _tree(root).packages()
+            except Exception:  # noqa: BLE001 - whatever a folder's content causes
+                _log.debug("packages below %s cannot be searched", root, exc_info=True)
 
     def expire(self) -> None:
         """Have the next look-up check all folders: another user, or another process, has searched them."""
