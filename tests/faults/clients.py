@@ -149,6 +149,15 @@ class Clients:
 
         await self._until(enough, "all registers are read")
 
+    async def wait_for_a_container(self) -> None:
+        """Wait until a container is there that a master has acknowledged."""
+
+        def there() -> bool:
+            self.check()
+            return Expected.RUNS in self._history.containers.values()
+
+        await self._until(there, "a container is made")
+
     async def _until(self, condition: Callable[[], bool], what: str) -> None:
         try:
             await until(condition, timeout=PATIENCE_S, what=what)
