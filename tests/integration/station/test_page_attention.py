@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from integration.station.test_page_operator import site
-from unit.station.test_station_view import changes, robot
+from support.planner_states import changes, robot
 
 from rce_fleet.station.world_link import things_text
 

@@ -7,7 +7,7 @@ import json
 import pytest
 from aiohttp.test_utils import TestServer
 from support.browser import BROWSER, CHROMIUM
-from unit.station.test_station_view import changes, pose, robot, state
+from support.planner_states import changes, pose, robot, state
 
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from integration.station.test_page_operator import drag
-from integration.station.test_robot_control import Site, site
 from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
+from support.controlled_robots import Site, site
 
 if TYPE_CHECKING:
     from playwright.async_api import Page

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 from integration.station.test_page_operator import Planner
-from integration.station.test_robot_control import Login
 from support.browser import BROWSER, CHROMIUM
+from support.controlled_robots import Login
+from support.planner_states import robot, state
 from support.ports import free_port
-from unit.station.test_station_view import robot, state
 
 from rce.guard import Places
 from rce.web.server import HttpServer

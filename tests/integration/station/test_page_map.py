@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from aiohttp.test_utils import TestServer
 from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
-from unit.station.test_station_view import pose, robot, state
+from support.planner_states import pose, robot, state
 
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp.test_utils import TestServer
 from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
-from unit.station.test_station_view import changes, pose, robot, state
+from support.planner_states import changes, pose, robot, state
 
 from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.feed import Feed

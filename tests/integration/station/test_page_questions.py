@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from integration.station.test_page_operator import site
-from unit.station.test_station_view import changes, robot
+from support.planner_states import changes, robot
 
 from rce_fleet.station.world_link import states_text, things_text
 

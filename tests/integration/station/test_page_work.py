@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from integration.station.test_page_operator import Planner, Site, site
 from support.fleet_manager import ManagerClient
-from unit.station.test_station_view import block, changes, robot
+from support.planner_states import block, changes, robot
 
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.task import StopVisit, TaskState

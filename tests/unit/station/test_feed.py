@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from unit.station.test_station_view import block, changes, pose, robot, state
+from support.planner_states import block, changes, pose, robot, state
 
 from rce_fleet.station.feed import REPEAT_POSE_S, Feed
 from rce_fleet.station.live import Page

@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from unit.station.test_station_view import robot, state
+from support.planner_states import robot, state
 
 from rce_fleet.station.figures import MAX_POINTS, FigureRecorder, columns_of
 from rce_fleet.station.planner_client import PlannerUnavailableError

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
-from unit.station.test_station_view import robot, state
+from support.planner_states import robot, state
 
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unit.station.test_station_view import robot, state
+from support.planner_states import robot, state
 
 from rce_fleet.station.commands.manual_watch import SHOWN_WAIT_S, ManualWatch
 from rce_fleet.station.view import FleetView

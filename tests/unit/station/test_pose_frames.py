@@ -8,7 +8,7 @@ import time
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from unit.station.test_station_view import pose, robot, state
+from support.planner_states import pose, robot, state
 
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.pose_frames import PoseRow, decode_poses, encode_poses

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from unit.station.test_station_view import changes, pose, robot, state
+from support.planner_states import changes, pose, robot, state
 
 from rce.aio.tasks import cancel_and_wait
 from rce_fleet.station import recording

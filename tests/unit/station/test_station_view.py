@@ -3,36 +3,12 @@
 from __future__ import annotations
 
 from math import cos, pi, sin
-from typing import Any
 
 import pytest
+from support.planner_states import block, changes, pose, robot, state
 
 from rce_fleet.station.live import MAX_CHANGES, MAX_EVENTS, Broadcast
 from rce_fleet.station.view import FleetView, ViewChange
-
-
-def robot(name: str, **changes: object) -> dict[str, Any]:
-    known = {
-        "id": name,
-        "state": "idle",
-        "reason": "",
-        "cell": 3,
-        "goal": -1,
-        "plan": [],
-        "granted": [],
-        "replans": 0,
-    }
-    return known | changes
-
-
-def state(*robots: dict[str, Any], **changes: object) -> dict[str, Any]:
-    grid = {"rows": 8, "columns": 8, "cell_size": 1.0, "origin_x": 0.0, "origin_y": 0.0}
-    return {**grid, "blocked": [], "walls": [], "pending": [], "robots": list(robots), **changes}
-
-
-def pose(x: float, y: float, yaw: float) -> dict[str, Any]:
-    orientation = {"x": 0.0, "y": 0.0, "z": sin(yaw / 2), "w": cos(yaw / 2)}
-    return {"pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": orientation}}}
 
 
 def test_view_is_empty_before_the_first_state() -> None:
@@ -66,10 +42,6 @@ def test_a_state_tells_what_it_changed() -> None:
     assert not view.on_state(state(robot("Robot1", goal=9), blocked=[1, 3]))
 
 
-def changes(*robots: dict[str, Any], **parts: object) -> dict[str, Any]:
-    return {"robots": list(robots), "removed": [], "blocked": [], "pending": [], "freed": [], **parts}
-
-
 def test_changes_are_applied_to_robots_and_cells() -> None:
     view = FleetView()
     view.on_state(state(robot("Robot1"), robot("Robot2"), blocked=[1, 2], pending=[3]))
@@ -92,10 +64,6 @@ def test_a_change_that_is_applied_again_does_no_harm() -> None:
     known = view.state
     view.on_changes(change)
     assert view.state == known
-
-
-def block(cell: int, by: str, **more: object) -> dict[str, Any]:
-    return {"cell": cell, "sensed": False, "by": by, "reason": "", "age": 10.0, "lifetime": 0.0, **more}
 
 
 def test_who_blocked_cells_is_followed() -> None:
