@@ -176,14 +176,15 @@ export class Actions {
   }
 
   // Many cells at once are one action, whose undo concerns those that were changed. A single cell is always sent, so that a refusal is shown.
-  async setCells(cells, blocked) {
+  // details: reason and end of cells that are blocked.
+  async setCells(cells, blocked, details = {}) {
     const changed = cells.length === 1 ? cells : cells.filter((cell) => !this.fleet.walls.has(cell) && (this.fleet.blocked.has(cell) || this.fleet.pending.has(cell)) !== blocked);
     if (!changed.length) return null;
     const text = (value, count) => t(value ? "action.block.done" : "action.free.done", { count });
-    // A cell that is blocked again, as by an undo, keeps reason and end.
+    // A cell that is blocked again, as by an undo, keeps reason and end, if no other ones are given.
     const before = new Map(changed.map((cell) => [cell, this.fleet.blocks.get(cell)]));
     const request = (cell) => {
-      const { reason, until } = before.get(cell) ?? {};
+      const { reason, until } = Object.keys(details).length ? details : (before.get(cell) ?? {});
       return { blocked: true, ...(reason && { reason }), ...(until && { until }) };
     };
     const set = async (value, wanted) => {

@@ -3,6 +3,7 @@
 import { Actions } from "./actions.js";
 import { Attention } from "./attention.js";
 import { AuditPanel } from "./audit_panel.js";
+import { BlockFields } from "./block_fields.js";
 import { describeCell } from "./cell_text.js";
 import { Connection } from "./connection.js";
 import { Drive } from "./drive.js";
@@ -75,6 +76,7 @@ const masters = new MastersPanel(fleet, operator);
 const replay = new Replay(view, fleet, say);
 tools.isPast = () => replay.at !== null;
 new ZoneForm(tools, actions, work);
+new BlockFields(tools);
 const tasks = new TasksPanel(work, actions, fleet);
 
 const releaseAll = () => actions.emergencyStop(null, false);

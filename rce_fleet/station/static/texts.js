@@ -58,6 +58,8 @@ const TEXTS = {
   "audit.dated": "{date}, {time}",
   "audit.find": "Find a user, an action or a robot",
   "audit.more": "Show more",
+  "block.minutes": "Free them after (minutes)",
+  "block.reason": "Why cells are blocked",
   cancel: "Cancel",
   "cell.blocked": "blocked",
   "cell.blockedBy": "blocked by {user}",

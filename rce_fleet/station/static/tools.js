@@ -6,6 +6,7 @@ import { t } from "./texts.js";
 export class Tools extends EventTarget {
   tool = "act";
   steers = true;
+  blockDetails = () => ({}); // reason and end of cells that are blocked with the tool for it
   isPast = () => false; // whether the map shows a past moment, or loads it: nothing is sent to the fleet of now
   #drag = null;   // {from: [x, y], to: [x, y], robot}
   #loadOf = null; // the task of the tool load
@@ -88,7 +89,7 @@ export class Tools extends EventTarget {
     const { from, to, robot } = drag;
     const cell = this.fleet.cellAt(...to);
     if (this.tool === "act" && robot && cell !== null) return this.actions.sendTo(robot, cell);
-    if (this.tool === "block" || this.tool === "free") return this.actions.setCells(this.cellsBetween(from, to), this.tool === "block");
+    if (this.tool === "block" || this.tool === "free") return this.#set(this.cellsBetween(from, to));
     if (this.tool === "zone") return this.dispatchEvent(new CustomEvent("zone", { detail: this.cellsBetween(from, to) }));
     this.#pick = null;
     if (this.tool === "pose") return this.actions.setPose(this.fleet.selected, ...from, Math.atan2(to[1] - from[1], to[0] - from[0]));
@@ -114,11 +115,17 @@ export class Tools extends EventTarget {
       fleet.select(robot);
       actions.sendTo(robot, cell);
     } else if (this.tool === "act") actions.setCells([cell], !shut) ?? null;
-    else if (this.tool === "block" || this.tool === "free") actions.setCells([cell], this.tool === "block");
+    else if (this.tool === "block" || this.tool === "free") this.#set([cell]);
     else if (this.tool === "zone") this.dispatchEvent(new CustomEvent("zone", { detail: [cell] }));
     else if (this.tool === "task") this.#pickOrDrop(cell);
     else if (this.tool === "load") this.#placeLoad(cell);
     else if (this.tool === "pose" && fleet.selected) this.#placeOrTurn(cell);
+  }
+
+  // Block or free cells.
+  #set(cells) {
+    const blocked = this.tool === "block";
+    return this.actions.setCells(cells, blocked, blocked ? this.blockDetails() : {});
   }
 
   // Two cells instead of a drag, for a keyboard: where the robot is, and which cell it looks towards.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp.test_utils import TestServer
 from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
-from support.planner_states import changes, pose, robot, state
+from support.planner_states import block, changes, pose, robot, state
 
 from rce_fleet.station.desired import DesiredCell
 from rce_fleet.station.feed import Feed
@@ -58,9 +58,11 @@ class Planner(FleetLink):
         raise PlannerUnavailableError("no manager")
 
     async def block_cell(self, wanted: DesiredCell) -> str:
-        cell = wanted.cell
-        change = changes(blocked=[cell]) if wanted.blocked else changes(freed=[cell])
-        self.feed.on_change(self.view.on_changes(change))
+        cell, lifetime = wanted.cell, wanted.until - time.time() if wanted.until else 0.0
+        said = block(cell, wanted.user, reason=wanted.reason, age=0.0, lifetime=lifetime)
+        blocked = changes(blocked=[cell], blocks=[said])
+        freed = changes(freed=[cell], removed_blocks=[cell])
+        self.feed.on_change(self.view.on_changes(blocked if wanted.blocked else freed, time.time()))
         return f"cell {cell}"
 
 
@@ -139,6 +141,31 @@ async def test_a_drag_blocks_cells_and_undo_frees_them() -> None:
         await other.wait_for_function("rceFleet.fleet.blocked.size === 0")
         late = await made.open()
         await late.wait_for_function("document.querySelectorAll('#audit li').length === 12")
+
+
+async def test_blocked_cells_get_the_reason_and_end_of_the_fields() -> None:
+    """What is filled in counts for cells that are blocked from then on; an empty end means none."""
+    async with site() as made:
+        page = await made.open()
+        assert not await page.is_visible("#block-fields")
+        await page.locator("#tool-block").click()
+        await page.locator("#block-reason").fill("wet floor")
+        await page.locator("#block-minutes").fill("30")
+        await drag(page, 18, 19)
+        await page.wait_for_function("rceFleet.fleet.blocks.size === 2")
+        for block in made.view.blocks():
+            assert block["reason"] == "wet floor"
+            assert block["until"] == pytest.approx(time.time() + 1800, abs=60)
+        await page.locator("#block-reason").fill("spill")
+        await page.locator("#block-minutes").fill("")
+        await click(page, 18)
+        await page.wait_for_function("rceFleet.fleet.blocks.get(18).reason === 'spill'")
+        assert await page.evaluate("rceFleet.fleet.blocks.get(18).until") is None
+        await page.locator("#tool-act").click()
+        assert not await page.is_visible("#block-fields")
+        await click(page, 20)
+        await page.wait_for_function("rceFleet.fleet.blocks.get(20)")
+        assert await page.evaluate("rceFleet.fleet.blocks.get(20).reason") == ""
 
 
 async def test_a_robot_is_dragged_to_its_goal() -> None:
