@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
-from integration.station.test_fleet_command import ROBOT, run
+from support.commanded_station import ROBOT, run
 
 from rce_fleet.api.fleet import ChargersState, EventPage, RobotList
-from rce_fleet.cli.access import TOKEN_VARIABLE
-from rce_master.cli.credentials import FILE_VARIABLE
 
 HEADER = "number,time,kind\r\n"
 
@@ -47,9 +44,7 @@ class Places:
 
 
 @pytest.fixture
-def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
-    monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "none.json"))
-    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+def places() -> Places:
     return Places()
 
 

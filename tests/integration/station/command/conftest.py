@@ -1,0 +1,36 @@
+"""A station for ``rce fleet``, and a file of logins that is empty."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from support.commanded_station import Station
+
+from rce_fleet.cli.access import TOKEN_VARIABLE
+from rce_master.cli.credentials import FILE_VARIABLE
+
+
+@pytest.fixture
+def station() -> Station:
+    return Station()
+
+
+@pytest.fixture
+async def url(station: Station) -> AsyncIterator[str]:
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", station.answer)
+    async with TestServer(app) as server:
+        yield str(server.make_url("/"))
+
+
+@pytest.fixture(autouse=True)
+def login(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    file = tmp_path / "login.json"
+    monkeypatch.setenv(FILE_VARIABLE, str(file))
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv("RCE_STATION", raising=False)
+    return file
