@@ -22,6 +22,7 @@ from pathlib import Path
 import hypothesis
 import psutil
 import pytest
+from support.short_folders import RUN_PREFIX, TMP, make_folder, sweep_old_folders
 
 TESTS = Path(__file__).parent
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
@@ -219,9 +220,9 @@ def missing(tool: str) -> str | None:
 def pytest_configure(config: pytest.Config) -> None:
     """Keep ``tmp_path`` short in parallel runs: paths of sockets in it have at most 107 bytes."""
     if _is_worker(config):
-        config.option.basetemp = tempfile.mkdtemp(prefix="rce-t-", dir="/tmp")
+        config.option.basetemp = str(make_folder())
     else:  # its environment is that of the workers, which it starts later
-        os.environ[RUN_FOLDER] = tempfile.mkdtemp(prefix="rce-run-", dir="/tmp")
+        os.environ[RUN_FOLDER] = tempfile.mkdtemp(prefix=RUN_PREFIX, dir=TMP)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -304,11 +305,12 @@ def _shares_with_its_module(item: pytest.Item) -> bool:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Remove the cgroups of test runs that were killed, once a run."""
+    """Remove cgroups and folders of test runs that were killed, once a run."""
     from tools.leaks import sweep_dead_cgroups
 
     if not _is_worker(session.config):
         sweep_dead_cgroups()
+        sweep_old_folders()
 
 
 def pytest_xdist_auto_num_workers() -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 from support.engine import engine_folder
+from support.short_folders import PREFIX, TMP
 from support.tls_engine import World
 
 
@@ -22,7 +23,7 @@ def folder() -> Iterator[Path]:
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[World]:
     public = getattr(request.module, "PUBLIC_CERTIFICATE", False)
-    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as folder:
+    with tempfile.TemporaryDirectory(prefix=PREFIX, dir=TMP) as folder:
         found = World(Path(folder), public=public)
         await found.start()
         try:

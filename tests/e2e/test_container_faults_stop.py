@@ -7,13 +7,13 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.engine import Program, running_engine, until
 from support.ports import free_ports
+from support.short_folders import make_folder
 from support.stranger import ask_for_echo, stranger
 
 from rce_container.environment.logs.streams import letters_of, text_of
@@ -36,7 +36,7 @@ while True:
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    path = make_folder()
     path.chmod(0o755)
     yield path
     sweep_cgroups(path)

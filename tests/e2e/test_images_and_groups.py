@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support.engine import running_engine
 from support.rootfs import image_of, make_rootfs
+from support.short_folders import PREFIX, TMP
 from support.stranger import stranger
 
 pytestmark = [
@@ -35,7 +36,7 @@ run(main())
 
 async def test_robot_reaches_image_and_group() -> None:
     """A robot is heard in an image and answered through its group."""
-    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as name:
+    with tempfile.TemporaryDirectory(prefix=PREFIX, dir=TMP) as name:
         folder = Path(name)
         folder.chmod(0o755)
         make_rootfs(folder / "root")

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from support.engine import until
 from support.networks import NetworkMachine, network
+from support.short_folders import PREFIX, TMP
 
 from rce.tls.folder import CertificateFolder
 
@@ -146,7 +147,7 @@ class Machines:
 
 @contextlib.asynccontextmanager
 async def machines(*, tls: bool) -> AsyncIterator[Machines]:
-    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as path, network(2) as places:
+    with tempfile.TemporaryDirectory(prefix=PREFIX, dir=TMP) as path, network(2) as places:
         folder = Path(path)
         world = Machines(folder, places, tls=tls)
         if tls:

@@ -7,9 +7,10 @@ import asyncio
 import secrets
 import shutil
 import sys
-import tempfile
 import traceback
 from pathlib import Path
+
+from support.short_folders import make_folder
 
 from faults.catalogue import SCENARIOS, Scenario
 from faults.goals import Times
@@ -36,7 +37,7 @@ def main() -> int:
         if options.only and scenario.name not in options.only:
             continue
         print(f"--- {scenario.name}", flush=True)
-        folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+        folder = make_folder()
         try:
             asyncio.run(_run(scenario, folder, options.seed, times, float(options.rounds)))
         except Exception as error:  # noqa: BLE001 - the other scenarios run, and the table is printed

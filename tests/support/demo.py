@@ -21,6 +21,7 @@ from rce_fleet.demo.resources import Ports, option_of
 from support.engine import command_line, engine_processes, until
 from support.ports import free_ports
 from support.processes import finish
+from support.short_folders import make_folder
 from tools.leaks import sweep_cgroups
 
 STOP_TIMEOUT_S = 120.0
@@ -37,7 +38,7 @@ def environment(folder: Path) -> dict[str, str]:
 @contextlib.contextmanager
 def clean_folder() -> Iterator[Path]:
     """A short-named folder; at the end no process of a demo in it may be left, and no file."""
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     try:
         yield folder
         left = engine_processes(folder)

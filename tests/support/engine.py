@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 import urllib.request
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, TypedDict, TypeVar, Unpack, overload
 import psutil
 
 from support.ports import free_ports
+from support.short_folders import make_folder
 from tools.leaks import sweep_cgroups
 
 T = TypeVar("T")
@@ -338,7 +338,7 @@ def _environments(folder: Path) -> list[psutil.Process]:
 @contextlib.contextmanager
 def engine_folder() -> Iterator[Path]:
     """Give a folder with a short name, which nodes may enter; check that an engine in it leaves nothing."""
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     folder.chmod(0o755)
     try:
         yield folder
@@ -356,7 +356,7 @@ def engine_folder() -> Iterator[Path]:
 @contextlib.asynccontextmanager
 async def running_engine(**options: Unpack[EngineOptions]) -> AsyncIterator[Engine]:
     """Run an engine, and check at its end that it leaves nothing."""
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     engine = Engine(folder, **options)
     try:
         await engine.start()

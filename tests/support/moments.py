@@ -12,7 +12,6 @@ import random
 import shutil
 import signal
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ import aiohttp
 from rce_container.environment import proc
 from support.engine import Program, until
 from support.ports import free_ports
+from support.short_folders import make_folder
 from support.stranger import ask_for_echo, stranger
 from tools.leaks import Traces, sweep_cgroups
 
@@ -68,7 +68,7 @@ class Moment:
 async def run(moment: Moment, runtime: str) -> list[str]:
     """Start an engine, end it at a moment, and return what is left of it."""
     signal.signal(signal.SIGQUIT, signal.SIG_DFL)  # jobs in the background of a shell ignore it
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     try:
         return await _run(moment, runtime, folder)
     finally:

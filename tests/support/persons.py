@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from support.short_folders import make_folder
+
 ROOT = Path(__file__).parents[2]
 USER = "rce-test"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -61,7 +63,7 @@ def root() -> Iterator[Person]:
     """Root, with the engine where it is."""
     if os.geteuid() != 0:
         pytest.skip("needs root")
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     yield Person("root", (), sys.executable, ROOT, folder)
     shutil.rmtree(folder)
 
@@ -71,7 +73,7 @@ def normal() -> Iterator[Person]:
     """A user with a Python of their own: the engine's may lie where nobody else can read it."""
     if os.geteuid() != 0:
         name = pwd.getpwuid(os.geteuid()).pw_name
-        folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+        folder = make_folder()
         yield Person(name, (), sys.executable, ROOT, folder)
         shutil.rmtree(folder)
         return
@@ -83,7 +85,7 @@ def normal() -> Iterator[Person]:
             f"{SYSTEM_PYTHON} is not Python {wanted}, so it cannot use the packages that are installed"
         )
     subprocess.run(["useradd", "--system", "--no-create-home", USER], check=False, capture_output=True)
-    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder = make_folder()
     folder.chmod(0o755)
     python = _copy_engine(folder)
     home = folder / "home"

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from rce_fleet.experiments.systems.roscpp_programs import compile_program
+from support.short_folders import RUN_PREFIX, TMP
 
 RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
 """Environment variable: the folder of what all workers of a test run share."""
@@ -26,4 +27,4 @@ def compiled(source: Path, *packages: str) -> Path:
 
 def run_folder() -> Path:
     """Return the folder of what all workers of a test run share."""
-    return Path(os.environ.get(RUN_FOLDER) or tempfile.mkdtemp(prefix="rce-run-", dir="/tmp"))
+    return Path(os.environ.get(RUN_FOLDER) or tempfile.mkdtemp(prefix=RUN_PREFIX, dir=TMP))
