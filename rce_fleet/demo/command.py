@@ -376,7 +376,7 @@ async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: b
         station = StationClient(session, demo.page)
         rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
         goals = RandomGoals(rng, None if config.lanes is None else config.goal_cells)
-        works = [tell_speed(demo.truth, say)]
+        works = [tell_speed(demo.truth, say), demo.keep_newcomers(say)]
         if auto:
             works.append(send_random_goals(station, goals, say, has_manager=config.mode is Mode.CLOUD))
         await demo.group.run_while_alive(_together(works))

@@ -11,7 +11,7 @@ from typing import Any
 from rce_fleet.demo.floor import FLOOR, with_surroundings
 from rce_fleet.demo.resources import LOOPBACK, Ports
 from rce_fleet.demo.worlds import NamedWorld
-from rce_fleet.drivers.scene import scene_of
+from rce_fleet.drivers.scene import load_scene, scene_of
 from rce_fleet.maps.ros_map import save_map
 from rce_fleet.navigation.navigation import DriveLimits
 from rce_fleet.planning.lane_files import lane_text
@@ -229,3 +229,8 @@ class DemoConfig:
             save_map(scene.draw(boxes=True), self.true_map_file)
         elif self.full:
             save_map(scene.draw(), self.map_file)
+
+    def write_map(self) -> None:
+        """Write the map of the walls if no robot has needed it until now."""
+        if not self.map_file.exists():
+            save_map(load_scene(self.scene).draw(), self.map_file)

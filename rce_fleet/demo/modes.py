@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
 
 import aiohttp
 
 from rce.config.documents import write_items
 from rce_fleet.demo.config import JOIN_TOGETHER, DemoConfig, Mode
+from rce_fleet.demo.newcomers import Newcomers
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
-from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robots
+from rce_fleet.demo.robots import (
+    RobotGraph,
+    client_config,
+    cloud_arguments,
+    dock_of,
+    start_robot,
+    start_robots,
+)
 from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
 from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
@@ -21,8 +31,13 @@ from rce_fleet.station.client import StationClient
 from rce_fleet.wiring import fleet_config, light_config
 
 if TYPE_CHECKING:
-    from rce_fleet.demo.exploration import Explored
+    from pathlib import Path
 
+    from rce_fleet.demo.exploration import Explored
+    from rce_fleet.geometry.poses import Pose
+
+_GRAPH_LINE = "robot {} ROS_MASTER_URI="
+"""Beginning of the line in which the world tells where a robot's graph is."""
 START_PER_ROBOT = 0.5
 """Seconds that the start may take longer for each robot: each has some ten connections in the engine."""
 
@@ -63,13 +78,14 @@ class CloudPrograms:
     def __init__(self, config: DemoConfig) -> None:
         self._config = config
         self._graphs: list[RobotGraph] = []
+        self._world: Program | None = None
 
     async def start(self, group: ProgramGroup) -> str:
         """Start all programs; return the URL of the page."""
         config = self._config
         self._write_files()
         engine = await group.start("engine", self._engine_argv(), stop_last=True)
-        world = await group.start("world", self._world_argv())
+        world = self._world = await group.start("world", self._world_argv())
         await group.wait_line(engine, "RCE ready:", START_TIMEOUT)
         self._graphs = await self._find_graphs(group, world)
         light = await self._find_light_graphs(group, world)
@@ -95,6 +111,43 @@ class CloudPrograms:
         account = self._config.account
         return await read_engine_totals(account.url, account.user, account.password)
 
+    @asynccontextmanager
+    async def joined(self, group: ProgramGroup, number: int, at: Pose) -> AsyncIterator[None]:
+        """Make a robot that was put into the world one of the fleet, until the block is left.
+
+        Args:
+            group: Gets the robot's programs, and loses them at the end.
+            number: Of the robot: ``Robot4`` has 4.
+            at: Where it stands.
+
+        Raises:
+            DemoError: Its programs were not ready in time.
+            OSError: A program cannot be started, or a file cannot be written.
+        """
+        assert self._world is not None, "robots are put into a world that runs"
+        config, robot, name = self._config, f"Robot{number}", f"robot{number}"
+        await asyncio.to_thread(config.write_map)
+        self._write_config(name, client_config(config, number, at))
+        uri = await group.wait_line(self._world, _GRAPH_LINE.format(robot), START_TIMEOUT)
+        graph = RobotGraph(robot, uri, offloaded=config.offload)
+        async with AsyncExitStack() as stack:
+            nodes = await start_robot(group, config, graph, at, self.launch_arguments(graph))
+            stack.push_async_callback(group.end, nodes)
+            bridge = await self._start_bridge(group, name, uri)
+            stack.push_async_callback(group.end, bridge)
+            await _wait_ready(group, [bridge], 1)
+            yield
+
+    async def _start_bridge(self, group: ProgramGroup, name: str, uri: str) -> Program:
+        argv = [sys.executable, "-m", "rce_client.ros_bridge", str(self._config_file(name))]
+        return await group.start(name, argv, env={"ROS_MASTER_URI": uri}, restartable=True)
+
+    def _config_file(self, name: str) -> Path:
+        return self._config.folder / f"{name}.config"
+
+    def _write_config(self, name: str, content: Mapping[str, Any]) -> None:
+        self._config_file(name).write_text(write_items(content), encoding="utf-8")
+
     async def _start_bridges(self, group: ProgramGroup, light: Mapping[str, str]) -> None:
         """Connect all robots, the next ones when those before are ready: the master answers in time then.
 
@@ -114,28 +167,27 @@ class CloudPrograms:
             if robots + count > JOIN_TOGETHER:
                 await _wait_ready(group, joining, robots)
                 joining, robots = [], 0
-            argv = [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"{name}.config")]
-            joining.append(await group.start(name, argv, env={"ROS_MASTER_URI": uri}, restartable=True))
+            joining.append(await self._start_bridge(group, name, uri))
             robots += count
         await _wait_ready(group, joining, robots)
 
     def _write_files(self) -> None:
-        config, account, folder = self._config, self._config.account, self._config.folder
+        config, account = self._config, self._config.account
         config.write_scene()
         robots = len(config.scenario.robots)
         fleet = fleet_config(account, config.planner_parameters, config.manager_parameters, robots=robots)
-        (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
-        files = {f"robot{number}": client_config(config, number) for number in range(1, config.full + 1)}
-        files |= {_light_name(*ends): light_config(*ends, account) for ends in config.light_groups}
-        for name, content in files.items():
-            (folder / f"{name}.config").write_text(write_items(content), encoding="utf-8")
+        self._write_config("fleet", fleet)
+        for number, robot in enumerate(config.scenario.robots[: config.full], start=1):
+            self._write_config(f"robot{number}", client_config(config, number, dock_of(config, robot)))
+        for ends in config.light_groups:
+            self._write_config(_light_name(*ends), light_config(*ends, account))
 
     async def _find_graphs(self, group: ProgramGroup, world: Program) -> list[RobotGraph]:
         """Return each robot's graph, as the world prints it."""
         return [
             RobotGraph(
                 robot,
-                await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT),
+                await group.wait_line(world, _GRAPH_LINE.format(robot), START_TIMEOUT),
                 offloaded=self._config.offload,
             )
             for robot in self._config.scenario.robots[: self._config.full]
@@ -210,6 +262,15 @@ class RunningDemo:
     group: ProgramGroup
     mode: ModePrograms
     explored: Explored | None = None
+
+    async def keep_newcomers(self, say: Callable[[str], None]) -> None:
+        """Make robots that are put into the world robots of the fleet, until cancelled.
+
+        Only the engine takes them: the graphs of the other modes are made for the first robots.
+        """
+        if isinstance(self.mode, CloudPrograms):
+            first = frozenset(self.config.scenario.robots)
+            await Newcomers(first, self.truth, partial(self.mode.joined, self.group), say).run()
 
     def truth(self) -> WorldReport | None:
         """Return the newest report of the simulated world; None before the first."""

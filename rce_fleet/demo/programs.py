@@ -83,9 +83,9 @@ class Program:
         self._show(line)
 
     async def wait_line(self, start: str) -> str:
-        """Wait for a line that begins with ``start``; return the rest of the line."""
+        """Wait for a line that begins with ``start``; return the rest of the newest such line."""
         while True:
-            for line in self._lines:
+            for line in reversed(self._lines):
                 if line.startswith(start):
                     return line[len(start) :].strip()
             self._printed.clear()

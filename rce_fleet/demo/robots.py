@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -12,6 +12,7 @@ from rce.config import configs_dir
 from rce.ros.tf import frames
 from rce_fleet.demo.programs import Program, ProgramGroup, rce_command
 from rce_fleet.demo.resources import LOOPBACK
+from rce_fleet.geometry.poses import Pose
 from rce_fleet.turtlebot_wiring import LAUNCH_FILE, offloaded_config, onboard_config
 
 if TYPE_CHECKING:
@@ -88,11 +89,11 @@ async def start_robots(
     """
     for graph in robots.graphs():
         arguments = {**robots.launch_arguments(graph), **(more or {}).get(graph.robot, {})}
-        await start_robot(group, config, graph, arguments)
+        await start_robot(group, config, graph, dock_of(config, graph.robot), arguments)
 
 
 async def start_robot(
-    group: ProgramGroup, config: DemoConfig, graph: RobotGraph, arguments: Mapping[str, object]
+    group: ProgramGroup, config: DemoConfig, graph: RobotGraph, at: Pose, arguments: Mapping[str, object]
 ) -> Program:
     """Start the nodes of a robot: its launch file, in one process.
 
@@ -102,9 +103,10 @@ async def start_robot(
         group: Gets the program.
         config: What the demo runs.
         graph: Where the robot's nodes are.
+        at: Where the robot stands.
         arguments: More arguments of the launch file.
     """
-    argv = [*graph.host, *launch_argv(config, graph.robot, arguments)]
+    argv = [*graph.host, *launch_argv(config, at, arguments)]
     return await group.start(
         f"nodes-{graph.robot}",
         argv,
@@ -115,28 +117,31 @@ async def start_robot(
     )
 
 
-def launch_argv(config: DemoConfig, robot: str, arguments: Mapping[str, object]) -> list[str]:
+def launch_argv(config: DemoConfig, at: Pose, arguments: Mapping[str, object]) -> list[str]:
     """Return the command that starts the nodes of a robot.
 
     Args:
         config: What the demo runs.
-        robot: Name of the robot.
+        at: Where the robot stands.
         arguments: More arguments of the launch file.
     """
-    given = {"map": config.map_file, **dict(_initial_pose(config, robot)), **arguments}
+    given = {"map": config.map_file, **initial_pose(at), **arguments}
     words = (f"{name}:={value}" for name, value in given.items())
     options = ("--one-process", "--wait", "--no-log", "--screen")
     return [*rce_command("launch"), *options, str(configs_dir() / LAUNCH_FILE), *words]
 
 
-def client_config(config: DemoConfig, number: int) -> Mapping[str, Any]:
-    """Return the config with which ``rce-ros`` connects a robot to the engine; robots count from 1."""
+def client_config(config: DemoConfig, number: int, at: Pose) -> Mapping[str, Any]:
+    """Return the config with which ``rce-ros`` connects a robot to the engine.
+
+    Args:
+        config: What the demo runs.
+        number: Of the robot, counted from 1.
+        at: Where the robot stands.
+    """
     if not config.offload:
         return onboard_config(number, config.account)
-    robot = config.scenario.robots[number - 1]
-    made = offloaded_config(
-        number, config.account, launch_arguments=dict(_initial_pose(config, robot)), own_map=True
-    )
+    made = offloaded_config(number, config.account, launch_arguments=initial_pose(at), own_map=True)
     (container,) = made["containers"]
     # The judge hears of recoveries here.
     diagnostics = {"topic": "/diagnostics", "type": "diagnostic_msgs/DiagnosticArray"}
@@ -149,14 +154,14 @@ def cloud_arguments(config: DemoConfig, robot: str) -> dict[str, object]:
     return {"offload": True, "own_map": True} if config.offload else {"robot": robot, "relay": False}
 
 
-def _initial_pose(config: DemoConfig, robot: str) -> Iterator[tuple[str, float]]:
-    """Return where the robot stands at the start: its dock, which is known."""
+def dock_of(config: DemoConfig, robot: str) -> Pose:
+    """Return where a robot of the scenario stands at the start."""
     scenario = config.scenario
     index = scenario.robots.index(robot)
-    x, y = scenario.grid.centre(scenario.starts[index])
-    yield "initial_pose_x", x
-    yield "initial_pose_y", y
-    yield "initial_pose_a", scenario.headings[index]
-    yield "initial_cov_xx", DOCK_VARIANCE
-    yield "initial_cov_yy", DOCK_VARIANCE
-    yield "initial_cov_aa", DOCK_VARIANCE
+    return Pose(*scenario.grid.centre(scenario.starts[index]), scenario.headings[index])
+
+
+def initial_pose(at: Pose) -> dict[str, float]:
+    """Return the launch file's arguments for a robot whose place at the start is known."""
+    pose = {"initial_pose_x": at.x, "initial_pose_y": at.y, "initial_pose_a": at.yaw}
+    return {**pose, **dict.fromkeys(("initial_cov_xx", "initial_cov_yy", "initial_cov_aa"), DOCK_VARIANCE)}

@@ -8,14 +8,16 @@ from math import hypot
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import pytest_asyncio
 from playwright.async_api import Browser, Page, ViewportSize, async_playwright
 from support.browser import CHROMIUM, FEW_FRAMES
 from support.demo import Demo, running_demo
+from support.engine import command_line, until
 
 from rce_fleet.demo.floor import FLOOR
-from rce_fleet.drivers.report import read_report
+from rce_fleet.drivers.report import WorldReport, read_report
 from rce_fleet.planning.scenario import midway_cell
 
 pytestmark = [
@@ -108,12 +110,16 @@ async def robot_of(page: Page, robot: str) -> dict[str, Any]:
     return found
 
 
-def midway(demo: Demo, robot: str, seen: dict[str, Any]) -> int:
-    """A cell on a robot's way that it does not need."""
+def world_of(demo: Demo) -> WorldReport:
     (report,) = demo.folder.glob("rce-demo-*/world.json")
     truth = read_report(report)
     assert truth is not None
-    grid = FLOOR.with_blocked(FLOOR.blocked.union(truth.boxes))
+    return truth
+
+
+def midway(demo: Demo, robot: str, seen: dict[str, Any]) -> int:
+    """A cell on a robot's way that it does not need."""
+    grid = FLOOR.with_blocked(FLOOR.blocked.union(world_of(demo).boxes))
     cell = midway_cell(grid, {robot: seen["plan"]}, {robot: seen["goal"]}, seen["granted"][:3])
     assert cell is not None
     return cell
@@ -237,3 +243,47 @@ async def test_the_page_on_a_phone(browser: Browser, shared_demo: Demo) -> None:
         await page.locator("tr[data-robot=Robot2]").tap()
         await page.wait_for_function("rceFleet.fleet.selected === 'Robot2'")
         await page.screenshot(path=artifact("fleet-phone.png"))
+
+
+async def test_a_robot_that_is_put_in_joins_the_fleet(browser: Browser, shared_demo: Demo) -> None:
+    """It drives to a goal, and its programs end when it is taken out. Tests after this one see it as lost."""
+    truth = world_of(shared_demo)
+    taken = {robot.cell for robot in truth.robots if robot.cell is not None}
+    free = set(FLOOR.with_blocked(FLOOR.blocked.union(truth.boxes, taken)).free)
+    cell = min(cell for cell in free if cell + 1 in free and (cell + 1) % FLOOR.columns)
+    async with opened(browser, shared_demo) as page:
+        await robots_placed(page, 3)
+        await page.locator("#view-both").click()
+        await page.wait_for_function("rceFleet.world.canvas.width > 100")
+        await page.locator("#simulation-add_robot").click()
+        await page.evaluate(
+            "([x, y]) => Object.assign(rceFleet.world.orbit, { x, y, distance: 4, tilt: 1.5 })",
+            FLOOR.centre(cell),
+        )
+        await page.locator("#world").click()  # in its middle
+        await robots_placed(page, 4)
+        await page.wait_for_function("cell => rceFleet.fleet.robots.get('Robot4').cell === cell", arg=cell)
+        await page.wait_for_function("document.querySelector('#simulation-outside').textContent === ''")
+        await page.locator("tr[data-robot=Robot4]").click()
+        await click_cell(page, cell + 1)
+        await page.wait_for_function(
+            """cell => {
+                const robot = rceFleet.fleet.robots.get("Robot4");
+                return robot.cell === cell && robot.state === "arrived";
+            }""",
+            arg=cell + 1,
+        )
+        await page.screenshot(path=artifact("fleet-newcomer.png"))
+        await page.locator("#simulation-remove").click()
+        await page.evaluate(
+            "([x, y]) => Object.assign(rceFleet.world.orbit, { x, y })", FLOOR.centre(cell + 1)
+        )
+        await page.locator("#world").click()
+        await page.locator("#question-yes").click()
+
+        def programs() -> list[psutil.Process]:
+            children = psutil.Process(shared_demo.process.pid).children(recursive=True)
+            return [one for one in children if any("robot4.config" in word for word in command_line(one))]
+
+        await until(lambda: not programs(), timeout=WAIT_MS / 1000, what="its bridge has ended")
+        assert "Robot4 joins the fleet" in shared_demo.output()

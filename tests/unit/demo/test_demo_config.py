@@ -9,7 +9,7 @@ from rce.config.client import loads
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig
 from rce_fleet.demo.resources import Ports
-from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, launch_argv
+from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, dock_of, launch_argv
 from rce_fleet.demo.ros_modes import (
     PLANNER,
     move_client_argv,
@@ -51,7 +51,7 @@ def test_each_robot_of_the_world_joins_its_own_core() -> None:
 
 def test_robot_starts_at_its_dock_and_later_where_it_was() -> None:
     """A launch gives the robot the pose of its start; one that follows lets it keep the stored pose."""
-    argv = launch_argv(CONFIG, "Robot2", {"robot": "Robot2"})
+    argv = launch_argv(CONFIG, dock_of(CONFIG, "Robot2"), {"robot": "Robot2"})
     scenario = CONFIG.scenario
     x, y = scenario.grid.centre(scenario.starts[1])
     assert {f"initial_pose_x:={x}", f"initial_pose_y:={y}", "map:=/folder/map.yaml"} <= {*argv}
@@ -61,7 +61,7 @@ def test_robot_starts_at_its_dock_and_later_where_it_was() -> None:
 
 def test_offloaded_robot_brings_its_map_and_starts_at_its_dock() -> None:
     config = replace(CONFIG, offload=True)
-    made = loads(write_items(dict(client_config(config, 2))))
+    made = loads(write_items(dict(client_config(config, 2, dock_of(config, "Robot2")))))
     nodes = {item.node.exe for item in made.nodes}
     assert nodes == {"amcl", "move_base", "obstacle_cells.py", "move_client.py"}
     parameters = {item.parameter.name: item.parameter.value for item in made.parameters}
@@ -70,7 +70,9 @@ def test_offloaded_robot_brings_its_map_and_starts_at_its_dock() -> None:
     assert (parameters["/amcl/initial_pose_x"], parameters["/amcl/initial_pose_y"]) == (x, y)
     ends = {item.path: item.interface.addr for item in made.interfaces}
     assert {"/map", "/diagnostics"} <= {*ends.values()}
-    assert "own_map:=True" in launch_argv(config, "Robot2", cloud_arguments(config, "Robot2"))
+    assert "own_map:=True" in launch_argv(
+        config, dock_of(config, "Robot2"), cloud_arguments(config, "Robot2")
+    )
 
 
 def test_move_client_without_namespace_finds_the_robots_topics() -> None:
