@@ -175,7 +175,7 @@ class WorldServices:
                     override=wanted.override,
                 )
                 uri = await self._robots.add_robot(start)
-                more = f"; its ROS master is {uri}: connect it to the fleet with rce-ros, and start its nodes"
+                more = f"; its ROS master is {uri}; it joins the fleet once rce-ros and its nodes run for it"
         except ValidationError as error:
             return _refused("; ".join(str(fault) for fault in faults_of(error, RobotStart)))
         except (FleetError, ConfigError, ValueError, OSError) as error:

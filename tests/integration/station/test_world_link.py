@@ -74,7 +74,7 @@ async def test_an_operator_changes_a_simulated_world(tmp_path: Path) -> None:
         with pytest.raises(WorldError, match="box9"):
             await world.act(WorldRequest(action="remove", name="box9"))
         said = await world.act(WorldRequest(action="add_robot", name="Robot9", x=6, y=6))
-        assert "connect it to the fleet" in said
+        assert "it joins the fleet once" in said
         await world.act(WorldRequest(action="reset"))
         await until_place("Robot1", 1, 1)
         await check_starts(world, until_place, until_told)
