@@ -13,6 +13,7 @@ from aiohttp import hdrs, web
 from multidict import CIMultiDict
 from yarl import URL
 
+from rce.tls import CertificateError, explain_to_client
 from rce.web.client import UPLOAD_S, Sent, noting_sent
 from rce.web.origin import is_foreign
 from rce.web.writing import write
@@ -173,6 +174,8 @@ class Forwarder:
                 async for piece in reply.content.iter_any():
                     await write(request, response, piece)
                 await response.write_eof()
+        except CertificateError as error:  # of our own files
+            raise NotForwardedError(f"{leader.name} leads; {error}") from error
         except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
             return self._broken(request, leader, response, error, sent)
         return response
@@ -194,8 +197,11 @@ class Forwarder:
             if request.transport is not None:
                 request.transport.abort()  # so that the client does not take the part for the whole
             return response
-        why = str(error) or "it leads no more"
+        distrust = explain_to_client(error)
+        why = distrust or str(error) or "it leads no more"
         self._failures.note(f"{request.method} {request.path} was not answered by {leader.name}: {why}")
+        if distrust and not sent.begun:
+            raise NotForwardedError(f"{leader.name} leads at {leader.url}: {distrust}") from error
         if not sent.begun or request.method in _SAFE:
             raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
         text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"
