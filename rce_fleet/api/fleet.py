@@ -167,9 +167,12 @@ class ZoneModel(ZoneRequest):
 
 
 class ZoneList(ApiModel):
-    """All zones."""
+    """Zones by name: all, or a page of them."""
 
     zones: list[ZoneModel]
+    next: str | None = Field(
+        default=None, description="The cursor of the next page; null: these are the last."
+    )
 
 
 class CellChange(ApiModel):

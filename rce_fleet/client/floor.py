@@ -70,7 +70,14 @@ class FloorRequests(ApiRequests):
             print([zone.id for zone in await fleet.zones()])
             ```
         """
-        return (await self._read("/zones", ZoneList)).zones
+        zones: list[ZoneModel] = []
+        query = {"limit": "100"}
+        while True:
+            page = await self._read("/zones", ZoneList, query)
+            zones += page.zones
+            if page.next is None:
+                return zones
+            query["cursor"] = page.next
 
     async def zone(self, name: str) -> ZoneModel:
         """Return a zone.

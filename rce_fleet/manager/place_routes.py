@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, cast
 
 from rce_fleet.api.fleet import (
@@ -15,7 +16,7 @@ from rce_fleet.api.fleet import (
     ZoneRequest,
 )
 from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
-from rce_fleet.limits import MOST_CELL
+from rce_fleet.limits import MOST_CELL, MOST_ZONES
 from rce_fleet.manager.cell_blocks import describe_block
 from rce_fleet.manager.goals import NO_ANSWER
 from rce_fleet.manager.planner_sync import BlockCell
@@ -80,10 +81,15 @@ def check_cells(call: Call, cells: Iterable[int]) -> None:
 
 
 async def zones(call: Call) -> FleetAnswer:
-    """Return all zones."""
-    call.only()
+    """Return zones by name: all, or a page of them; of some kinds only."""
+    call.only("limit", "cursor", "kind")
+    limit, after = call.count("limit", 0, MOST_ZONES), call.query.get("cursor", "")
+    kinds = call.query.get("kind", "").split(",")
     found = sorted(call.manager.book.zones.values(), key=lambda zone: zone.id)
-    return shown(ZoneList(zones=[_show_zone(zone) for zone in found]))
+    fitting = (zone for zone in found if zone.id > after and (kinds == [""] or zone.kind in kinds))
+    page = list(islice(fitting, limit or None))
+    more = next(fitting, None) is not None
+    return shown(ZoneList(zones=[_show_zone(zone) for zone in page], next=page[-1].id if more else None))
 
 
 async def zone(call: Call) -> FleetAnswer:

@@ -344,7 +344,11 @@ ROUTES: list[Route[str]] = [
         body=ChargersModel,
         reply=ChargersState,
     ),
-    _route("GET", "/zones", "", "List zones", reply=ZoneList),
+    _route(
+        *("GET", "/zones", "", "List zones, by name; all of them without limit"),
+        reply=ZoneList,
+        query=(Query(name="kind", description="Kinds, separated by commas."), _CURSOR, _LIMIT),
+    ),
     _route("GET", "/zones/{id}", "", "Return a zone", reply=ZoneModel, name="get_zone"),
     _route(
         *("PUT", "/zones/{id}", "set_zone", "Make (201) or replace a zone"),

@@ -36,6 +36,27 @@ async def test_pages_of_tasks_follow_each_other(client: ManagerClient) -> None:
     assert ([task["id"] for task in ended["tasks"]], ended["next"]) == (["T3"], None)
 
 
+async def test_pages_of_zones_follow_each_other(client: ManagerClient) -> None:
+    for name in ("dock", "aisle", "crossing", "gate"):
+        zone = (
+            {"kind": "slow", "cells": [3], "value": 0.5}
+            if name == "dock"
+            else {"kind": "blocked", "cells": [4]}
+        )
+        assert (await client.ask("PUT", f"/zones/{name}", zone))[0] == 201
+
+    async def listed(query: str) -> tuple[list[str], str | None]:
+        found = (await client.ask("GET", f"/zones?{query}"))[1]
+        return [zone["id"] for zone in found["zones"]], found["next"]
+
+    assert await listed("") == (["aisle", "crossing", "dock", "gate"], None)
+    assert await listed("limit=3") == (["aisle", "crossing", "dock"], "dock")
+    assert await listed("limit=3&cursor=dock") == (["gate"], None)
+    assert await listed("kind=blocked,cost&limit=2") == (["aisle", "crossing"], "crossing")
+    assert await listed("kind=blocked,cost&limit=2&cursor=crossing") == (["gate"], None)
+    assert (await client.ask("GET", "/zones?limit=many"))[0] == 422
+
+
 async def test_events_are_asked_for_by_kind_and_robot(client: ManagerClient) -> None:
     await client.ask("POST", "/tasks", GO)
     client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=3)
