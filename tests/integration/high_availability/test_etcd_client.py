@@ -151,8 +151,8 @@ async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
         store = EtcdStore(client, "/rce")
         first = await etcd.leader()
         first.send(signal.SIGKILL)
-        await store.save([Row("users", "a", b"1")])
         second = await etcd.leader_of([member for member in etcd.members if member is not first])
+        await store.save([Row("users", "a", b"1")])
         second.send(signal.SIGSTOP)
         (third,) = [member for member in etcd.members if member not in (first, second)]
         text = await refusal(third.endpoint)
@@ -160,6 +160,7 @@ async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
         assert "rce cluster recover" in text
         await check_runtime_faults(client)
         second.send(signal.SIGCONT)
+        await etcd.leader_of([second, third])
         await store.save([Row("users", "b", b"2")])
         assert await store.load() == {"users": {"a": b"1", "b": b"2"}}
 

@@ -175,10 +175,13 @@ async def test_a_stop_of_all_robots_is_one_row() -> None:
         group = page.locator("#attention-list li", has_text="11 robots:")
         await made.until(lambda: made.control.undelivered == ["Robot2"])
         await group.wait_for()
-        rows = page.locator("#attention-list li")
-        assert await rows.count() == 2
-        assert (await rows.first.inner_text()).startswith("!!Robot2")
-        assert await page.locator("#attention-count").inner_text() == "12"
+        await page.wait_for_function(
+            """() => {
+                const rows = document.querySelectorAll("#attention-list li");
+                const count = document.querySelector("#attention-count").innerText;
+                return rows.length === 2 && rows[0].innerText.startsWith("!!Robot2") && count === "12";
+            }"""
+        )
         await group.locator("summary").click()
         await group.locator("button", has_text="Robot12").click()
         await page.locator("#robot-card", has_text="Robot12").wait_for()
