@@ -29,6 +29,7 @@ from rce_fleet.station.commands.velocity_sender import velocity_sender
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.layers.frames import LayerError
 from rce_fleet.station.view import FleetView
 from rce_fleet.wiring import FleetAccount, robot_config
 
@@ -85,7 +86,16 @@ async def robot_at_engine() -> AsyncIterator[Site]:
         watch = EngineWatch(engine.url, "testUser", "testUser", on_state=lambda _: None)
         watching = asyncio.create_task(watch.run())
         await bridge.start()
+        tags = {item["iTag"] for item in kept["interfaces"]}
+
+        async def offers_all() -> bool:
+            with suppress(LayerError):
+                return tags <= {item["tag"] for item in await watch.read_items("interfaces")}
+            return False
+
         try:
+            # A drive that begins before measures no round trip.
+            await until(offers_all, what="the engine knows all interfaces of the robot")
             yield Site(engine.url, engine.folder, bridge, got, told, watch)
         finally:
             watching.cancel()
