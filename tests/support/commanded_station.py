@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import Any
 
 from aiohttp import web
+from aiohttp.test_utils import TestServer
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
@@ -135,6 +138,15 @@ class Station:
         }
         is_list = path == "tasks" and method == "GET"
         return TaskPage(tasks=[TASK], next=None) if is_list else found.get(path, TASK)
+
+
+@asynccontextmanager
+async def served(handler: Callable[[web.Request], Awaitable[web.Response]]) -> AsyncIterator[str]:
+    """Serve all requests by one handler; give the address."""
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", handler)
+    async with TestServer(app) as server:
+        yield str(server.make_url("/"))
 
 
 async def run(url: str, *words: str) -> tuple[int, str]:

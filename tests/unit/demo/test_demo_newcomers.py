@@ -28,10 +28,20 @@ class Demo:
     """A world, and who is of its fleet."""
 
     def __init__(self) -> None:
-        self.truth: WorldReport | None = None
+        self.world: WorldReport | None = None
+        self.looks = 0
         self.fleet: dict[int, Pose] = {}
         self.said: list[str] = []
         self.broken: set[int] = set()
+
+    def truth(self) -> WorldReport | None:
+        self.looks += 1
+        return self.world
+
+    async def looked(self) -> None:
+        """Wait until the world was looked at, and what was seen there has been carried out."""
+        seen = self.looks
+        await self.until(lambda: self.looks >= seen + 2)
 
     @asynccontextmanager
     async def join(self, number: int, at: Pose) -> AsyncIterator[None]:
@@ -53,7 +63,7 @@ class Demo:
 async def demo(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Demo]:
     monkeypatch.setattr(newcomers, "LOOK_EVERY_S", 0.001)
     made = Demo()
-    following = Newcomers(frozenset({"Robot1"}), lambda: made.truth, made.join, made.said.append)
+    following = Newcomers(frozenset({"Robot1"}), made.truth, made.join, made.said.append)
     running = asyncio.create_task(following.run())
     yield made
     await cancel_and_wait(running)
@@ -63,23 +73,24 @@ async def demo(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Demo]:
 
 
 async def test_a_robot_joins_where_it_stands_until_it_is_taken_out(demo: Demo) -> None:
-    demo.truth = report(Robot1=(0.5, 0.5))
-    await asyncio.sleep(0.05)
-    demo.truth = report(Robot1=(0.5, 0.5), Robot4=(3.5, 2.5))
+    demo.world = report(Robot1=(0.5, 0.5))
+    await demo.looked()
+    assert demo.fleet == {}, "the demo has had it from the start"
+    demo.world = report(Robot1=(0.5, 0.5), Robot4=(3.5, 2.5))
     await demo.until(lambda: demo.fleet.get(4) == Pose(3.5, 2.5, 0.0))
-    demo.truth = report(Robot1=(0.5, 0.5), Robot4=(4.5, 2.5))
-    await asyncio.sleep(0.05)
+    demo.world = report(Robot1=(0.5, 0.5), Robot4=(4.5, 2.5))
+    await demo.looked()
     assert demo.fleet == {4: Pose(3.5, 2.5, 0.0)}, "it joins once"
-    demo.truth = report(Robot1=(0.5, 0.5))
+    demo.world = report(Robot1=(0.5, 0.5))
     await demo.until(lambda: demo.fleet == {})
-    demo.truth = report(Robot4=(1.5, 1.5))
+    demo.world = report(Robot4=(1.5, 1.5))
     await demo.until(lambda: demo.fleet.get(4) == Pose(1.5, 1.5, 0.0))
     assert demo.said == ["Robot4 joins the fleet"] * 2
 
 
 async def test_a_robot_that_cannot_join_leaves_the_others(demo: Demo) -> None:
     demo.broken.add(5)
-    demo.truth = report(Robot5=(1.5, 1.5), cart=(2.5, 2.5), Robot6=(3.5, 3.5))
+    demo.world = report(Robot5=(1.5, 1.5), cart=(2.5, 2.5), Robot6=(3.5, 3.5))
     await demo.until(lambda: 6 in demo.fleet and len(demo.said) == 3)
     assert "Robot5 stays outside the fleet: robot5 was not ready within 90 s" in demo.said
     assert "cart stays outside the fleet: only robots with names such as Robot7 join it" in demo.said

@@ -6,9 +6,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from aiohttp import web
-from aiohttp.test_utils import TestServer
-from support.commanded_station import Station
+from support.commanded_station import Station, served
 
 from rce_fleet.cli.access import TOKEN_VARIABLE
 from rce_master.cli.credentials import FILE_VARIABLE
@@ -21,10 +19,8 @@ def station() -> Station:
 
 @pytest.fixture
 async def url(station: Station) -> AsyncIterator[str]:
-    app = web.Application()
-    app.router.add_route("*", "/{path:.*}", station.answer)
-    async with TestServer(app) as server:
-        yield str(server.make_url("/"))
+    async with served(station.answer) as address:
+        yield address
 
 
 @pytest.fixture(autouse=True)

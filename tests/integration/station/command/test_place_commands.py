@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 from aiohttp import web
-from aiohttp.test_utils import TestServer
-from support.commanded_station import ROBOT, run
+from support.commanded_station import ROBOT, run, served
 
 from rce_fleet.api.fleet import ChargersState, EventPage, RobotList
 
@@ -50,10 +49,8 @@ def places() -> Places:
 
 @pytest.fixture
 async def url(places: Places) -> AsyncIterator[str]:
-    app = web.Application()
-    app.router.add_route("*", "/{path:.*}", places.answer)
-    async with TestServer(app) as server:
-        yield str(server.make_url("/"))
+    async with served(places.answer) as address:
+        yield address
 
 
 async def test_places_are_listed(url: str) -> None:
