@@ -5,16 +5,18 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import aiohttp
 import pytest
 from aiohttp import web
-from aiohttp.test_utils import TestServer
+from aiohttp.test_utils import TestServer, make_mocked_request
 from support.absent_masters import silent_master, unreachable_port
 from support.ports import free_port
 
 from rce.config import Secret
 from rce.guard import TrustedProxies
+from rce.tls.identity import TlsFiles, TlsIdentity
 from rce_master.cli.client import IDEMPOTENCY_KEY, ApiClient
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.http import forward as forwarding
@@ -358,3 +360,14 @@ async def test_what_a_silent_master_may_have_done_is_said(monkeypatch: pytest.Mo
             await client.call("DELETE", "/containers/a")
         assert asked.is_set()
     assert master.asked == []
+
+
+async def test_a_stand_by_with_unusable_certificates_says_which(tmp_path: Path) -> None:
+    """It has not asked the leader; the request may be sent to another master."""
+    (tmp_path / "authority.pem").write_text("no certificate")
+    identity = TlsIdentity(TlsFiles(authority=tmp_path / "authority.pem"))
+
+    async with Forwarder(FORWARDING, TrustedProxies(), identity.client) as forwarder:
+        request = make_mocked_request("POST", "/a")
+        with pytest.raises(NotForwardedError, match=r"first leads; .*authority\.pem"):
+            await forwarder.forward(request, Leader("first", 4, "https://127.0.0.1:9/"))
