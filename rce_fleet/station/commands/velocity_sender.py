@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import TaskScope
 from rce_fleet.station.commands.driving import RobotRoundTrip
 from rce_fleet.station.commands.kinds import (
     DRIVE_CLOCK,
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+TRY_AGAIN_S = 1.0
+"""Pause before the topics of the round trip are looked for again."""
+
 
 class VelocitySender:
     """Sends velocities to one robot, and measures the round trip if the robot answers.
@@ -32,7 +36,7 @@ class VelocitySender:
         sender: Of velocities.
 
     Attributes:
-        clock: Sends the time with each velocity; None: the robot does not offer it.
+        clock: Sends the time with each velocity; None: the robot does not offer it now.
         round_trip: From the station to the robot.
     """
 
@@ -63,6 +67,8 @@ class VelocitySender:
 async def velocity_sender(control: RobotControl, robot: str) -> AsyncIterator[VelocitySender]:
     """Give what sends velocities to a robot; the robot stands at the end.
 
+    If the robot does not offer yet what the round trip needs, it is tried again while the block runs.
+
     Args:
         control: Reaches the robot.
         robot: Its ID.
@@ -75,12 +81,40 @@ async def velocity_sender(control: RobotControl, robot: str) -> AsyncIterator[Ve
         stack.push_async_callback(sender.close)
         velocities = VelocitySender(sender)
         try:
-            await stack.enter_async_context(control.listen(robot, DRIVE_ECHO, velocities.take_echo))
-            velocities.clock = await control.open_unconnected(robot, DRIVE_CLOCK)
-            stack.push_async_callback(velocities.clock.close)
+            stack.push_async_exit(await _measure(control, robot, velocities))
         except CommandError as error:
-            _log.info("the round trip to %s is not measured: %s", robot, error)
+            _log.info("the round trip to %s is not measured yet: %s", robot, error)
+            tasks = await stack.enter_async_context(TaskScope())
+            tasks.spawn(_measure_later(control, robot, velocities), name=f"round trip to {robot}")
         try:
             yield velocities
         finally:
             velocities.send(0.0, 0.0)
+
+
+async def _measure(control: RobotControl, robot: str, velocities: VelocitySender) -> AsyncExitStack:
+    """Begin to measure the round trip; return what ends it.
+
+    Raises:
+        CommandError: The robot does not offer one of the topics, or cannot be reached.
+    """
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(control.listen(robot, DRIVE_ECHO, velocities.take_echo))
+        clock = await control.open_unconnected(robot, DRIVE_CLOCK)
+        stack.push_async_callback(clock.close)
+        velocities.clock = clock
+        return stack.pop_all()
+
+
+async def _measure_later(control: RobotControl, robot: str, velocities: VelocitySender) -> None:
+    """Try to measure the round trip until it works, and go on until cancelled."""
+    while True:
+        await asyncio.sleep(TRY_AGAIN_S)
+        try:
+            measuring = await _measure(control, robot, velocities)
+        except CommandError as error:
+            _log.debug("the round trip to %s is not measured yet: %s", robot, error)
+            continue
+        async with measuring:
+            _log.info("the round trip to %s is measured now", robot)
+            await asyncio.Event().wait()

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rce_fleet.station.commands import velocity_sender as velocity_sender_module
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.kinds import DRIVE_CLOCK, DRIVE_ECHO, VELOCITY, RobotCommand
 from rce_fleet.station.commands.sources import CommandError, CommandSender, CommandSource, Take
@@ -38,13 +39,14 @@ class Robot(CommandSource):
     """A robot that offers some topics.
 
     Attributes:
+        offered: The topics; others can be added.
         got: Topic and content of each message.
         used: The topics that the station uses.
         takes: What takes the robot's answers.
     """
 
     def __init__(self, *offered: RobotCommand) -> None:
-        self._offered = offered
+        self.offered = offered
         self.got: list[tuple[str, dict[str, Any]]] = []
         self.used: list[str] = []
         self.takes: list[Take] = []
@@ -57,11 +59,13 @@ class Robot(CommandSource):
     async def listen(self, robot: str, answer: RobotCommand, take: Take) -> AsyncIterator[None]:
         self._use(answer)
         self.takes.append(take)
-        yield
-        self.used.remove(answer.topic)
+        try:
+            yield
+        finally:
+            self.used.remove(answer.topic)
 
     def _use(self, command: RobotCommand) -> None:
-        if command not in self._offered:
+        if command not in self.offered:
             raise CommandError(f"no {command.topic}")
         self.used.append(command.topic)
 
@@ -87,4 +91,23 @@ async def test_a_robot_that_answers_nothing_is_driven(offered: tuple[RobotComman
         sender.send(0.2, 0.1)
         assert [topic for topic, _ in robot.got] == ["raw_cmd_vel"]
         assert sender.round_trip.seconds(0.0) is None
+    assert robot.used == []
+
+
+async def test_a_topic_that_is_offered_later_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one whose interfaces the engine makes one after the other."""
+    monkeypatch.setattr(velocity_sender_module, "TRY_AGAIN_S", 0.01)
+    robot = Robot(VELOCITY)
+    async with velocity_sender(RobotControl(robot, list), "Robot1") as sender:
+        for more in (DRIVE_ECHO, DRIVE_CLOCK):
+            await asyncio.sleep(0.05)
+            assert sender.clock is None
+            robot.offered += (more,)
+        async with asyncio.timeout(10):
+            while sender.clock is None:
+                await asyncio.sleep(0.01)
+        sender.send(0.2, 0.1)
+        assert [topic for topic, _ in robot.got] == ["drive_clock", "raw_cmd_vel"]
+        robot.takes[-1](robot.got[0][1]["data"])
+        assert sender.round_trip.seconds(asyncio.get_running_loop().time()) is not None
     assert robot.used == []
