@@ -124,6 +124,9 @@ class Experiment(ABC):
     """What it measures, in a line."""
     programs: ClassVar[tuple[str, ...]] = ()
     """Programs of the experiments that the software of robots must have."""
+    at_once: ClassVar[int] = 1
+    """How many of its runs are done at the same time: more than one disturb each other's figures, unless they
+    wait most of the time, and neither work nor delays are measured."""
 
     def possible(self, options: Options) -> Options:
         """Return the options with only the software that has all of the experiment's programs."""

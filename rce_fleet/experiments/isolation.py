@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.results import Condition
     from rce_fleet.experiments.systems.base import RunningWorkload, System
 
-RUNS = 3
+AT_ONCE = 4
 """The same comes out each time, unless something goes wrong."""
 SECONDS = 8.0
 PATIENCE_S = 30.0
@@ -43,6 +43,7 @@ class Isolation(Experiment):
     name = "isolation"
     title = "what a robot's program sees of another robot and can do to it; files and lines to add a robot"
     programs = ("listener", "reach", "robot_base")
+    at_once = AT_ONCE
 
     def setups(self, options: Options) -> list[Condition]:
         """Return a set-up for each system and software; quickly, with the first software only."""
@@ -57,11 +58,6 @@ class Isolation(Experiment):
         """Return about how long the run takes that does not count: there is none."""
         del setup, options
         return 0.0
-
-    def most_runs(self, setup: Condition) -> int:
-        """Return how many runs of a set-up count at most."""
-        del setup
-        return RUNS
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""

@@ -5,7 +5,7 @@ made there. What was killed is started again after some seconds, as by a supervi
 discovery and sync; the engine's master is started again by ``rce up`` itself. Programs are not restarted.
 New topics are declared beforehand where a system needs it: in MMS they are shared, in CRS they have bridges.
 
-A run takes up to a minute, so there are at most three of each set-up.
+A run takes up to a minute, and waits for most of it, so several are done at the same time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.systems.base import RunningWorkload, System
 
 CORE, MASTER, CUT = "core_killed", "master_killed", "machine_cut"
-RUNS = 3
+AT_ONCE = 4
 BEFORE_S = 15.0
 """How long topics may be made before the fault."""
 STEADY_S = 1.5
@@ -78,6 +78,7 @@ class Robustness(Experiment):
     name = "robustness"
     title = "core or master killed, machine cut off for 20 s: what stops, for how long, what is lost"
     programs = ("provider", "watcher")
+    at_once = AT_ONCE
 
     def setups(self, options: Options) -> list[Condition]:
         """Return set-ups by fault and system; with further software, only a killed core.
@@ -103,11 +104,6 @@ class Robustness(Experiment):
         """Return about how long the run takes that does not count: there is none."""
         del setup, options
         return 0.0
-
-    def most_runs(self, setup: Condition) -> int:
-        """Return how many runs of a set-up count at most."""
-        del setup
-        return RUNS
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""

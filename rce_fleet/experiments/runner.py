@@ -67,10 +67,9 @@ class Plan:
     runs: int
     seed: int
 
-    @property
-    def at_once(self) -> int:
-        """How many runs are done at the same time; more than one disturb each other's figures."""
-        return QUICK_AT_ONCE if self.options.quick else 1
+    def at_once(self, experiment: Experiment) -> int:
+        """Return how many runs of an experiment are done at the same time."""
+        return QUICK_AT_ONCE if self.options.quick else experiment.at_once
 
     def links(self) -> list[Link]:
         """Return the links that are measured first: the usual ones, and those of the experiments."""
@@ -130,7 +129,7 @@ class Plan:
         seconds = work.experiment.seconds
         if work.run.number == WARM_UP:
             seconds = work.experiment.warm_up_seconds
-        return seconds(work.run.condition, self.options_of(work.experiment)) / self.at_once
+        return seconds(work.run.condition, self.options_of(work.experiment)) / self.at_once(work.experiment)
 
 
 class Pace:
@@ -213,15 +212,24 @@ class Runner:
         await self._measure_link()
         rows = self.rows()
         pace = Pace(sum(self._plan.seconds(one, rows) for one in self._plan.experiments))
-        waiting: deque[tuple[Work, str]] = deque()
+        every: list[tuple[Work, str]] = []
         for experiment in self._plan.experiments:
             works = self._plan.works(experiment, rows)
-            waiting += [(work, f"{number} of {len(works)}") for number, work in enumerate(works, 1)]
+            placed = [(work, f"{number} of {len(works)}") for number, work in enumerate(works, 1)]
             if not works:
                 self._say(f"{experiment.name}: all runs are done")
-        if self._plan.at_once > 1:  # the longest first: none is left over at the end, alone
-            waiting = deque(sorted(waiting, key=lambda one: -self._plan.run_seconds(one[0])))
-        await together(*(self._do_all(waiting, pace) for _ in range(self._plan.at_once)))
+            if self._plan.options.quick:
+                every += placed
+            else:
+                await self._do_together(placed, self._plan.at_once(experiment), pace)
+        # Those of all experiments, the longest first: none is left over at the end, alone.
+        every.sort(key=lambda one: -self._plan.run_seconds(one[0]))
+        await self._do_together(every, QUICK_AT_ONCE, pace)
+
+    async def _do_together(self, works: list[tuple[Work, str]], at_once: int, pace: Pace) -> None:
+        """Do runs, some of them at the same time."""
+        waiting = deque(works)
+        await together(*(self._do_all(waiting, pace) for _ in range(at_once)))
 
     async def _do_all(self, waiting: deque[tuple[Work, str]], pace: Pace) -> None:
         """Do runs until none is waiting.

@@ -3,7 +3,7 @@
 Robots send scans as in the experiment ``laser``, which are not printed: a console is full long before a
 system is. The simulated robots are spread over several programs, so that these are not what breaks first.
 
-Runs of many robots take a minute, so of them there are less: at most three up to ten robots, one of more.
+Runs of many robots take a minute, so there is one of each number above ten.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from rce_fleet.experiments.workloads.telling import READY, reports
 if TYPE_CHECKING:
     from rce_fleet.experiments.systems.base import RunningWorkload, System
 
-ROBOTS = (1, 2, 5, 10, 20, 35, 50)
+ROBOTS = (1, 10, 20, 35, 50)
+"""The experiment ``laser`` has five."""
 QUICK_ROBOTS = (2,)
 ONE, EACH = "one", "each"
 """One container for all robots, or one for each."""
 FEW_ROBOTS = 10
-RUNS_OF_FEW, RUNS_OF_MANY = 3, 1
+RUNS_OF_MANY = 1
 WARMED_UP = ROBOTS[0]
 """Robots of the only set-up that is warmed up: the others run the same programs."""
 ROBOTS_PER_PROGRAM = 5
@@ -67,9 +68,9 @@ class Scaling(Experiment):
         """Return about how long the run takes that does not count."""
         return self.seconds(setup, options) if robots_of(setup) == WARMED_UP else 0.0
 
-    def most_runs(self, setup: Condition) -> int:
-        """Return how many runs of a set-up count at most."""
-        return RUNS_OF_FEW if robots_of(setup) <= FEW_ROBOTS else RUNS_OF_MANY
+    def most_runs(self, setup: Condition) -> int | None:
+        """Return how many runs of a set-up count at most; None: as many as are asked for."""
+        return None if robots_of(setup) <= FEW_ROBOTS else RUNS_OF_MANY
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""

@@ -239,9 +239,16 @@ class Meeting(Dice):
         return trial.measured([Value(f"eyes{number}", 1.0, "") for number in range(9)])
 
 
-async def test_runs_of_a_quick_plan_are_done_at_once(tmp_path: Path) -> None:
+class WaitingMeeting(Meeting):
+    """One of which two runs are done at the same time in any plan."""
+
+    at_once = 2
+
+
+@pytest.mark.parametrize(("meeting", "options"), [(Meeting(), QUICK), (WaitingMeeting(), OPTIONS)])
+async def test_runs_that_may_be_are_done_at_once(tmp_path: Path, meeting: Meeting, options: Options) -> None:
     """Their rows stay together, so that a resumed plan finds each one complete."""
-    await runner(tmp_path, Meeting(), [], options=QUICK).run()
+    await runner(tmp_path, meeting, [], options=options).run()
     rows = [row for row in read_rows(tmp_path / TABLE) if row.condition.experiment == "dice"]
     assert [row.metric for row in rows].count(DONE) == len(OPTIONS.systems) * RUNS
     runs = [(row.condition.system, row.run) for row in rows]

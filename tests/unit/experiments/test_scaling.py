@@ -23,9 +23,9 @@ def test_many_robots_run_less_often_than_few() -> None:
     numbers: dict[str, list[int]] = {}
     for _, (setup, number) in works:
         numbers.setdefault(dict(setup.factors)["robots"], []).append(number)
-    assert numbers["1"] == [0, 1, 2, 3]
+    assert numbers["1"] == numbers["10"] == list(range(11))
     assert numbers["50"] == [0, 1]
-    assert len(Plan([Scaling()], Options(systems=("single_master",)), 2, 1).works(Scaling(), [])) == 18
+    assert len(Plan([Scaling()], Options(systems=("single_master",)), 2, 1).works(Scaling(), [])) == 12
 
 
 @pytest.mark.parametrize(("robots", "expected"), [([1], [[1]]), ([1, 2, 3, 4, 5, 6], [[1, 3, 5], [2, 4, 6]])])
