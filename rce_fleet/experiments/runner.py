@@ -1,4 +1,4 @@
-"""Runs experiments: the link is measured first, then each set-up again and again; raw data go to a table.
+"""Runs experiments: the link is measured first, then all set-ups, round by round; raw data go to a table.
 
 A run that is interrupted leaves no rows that count: its row ``done`` is written last.
 """
@@ -212,19 +212,25 @@ class Runner:
         await self._measure_link()
         rows = self.rows()
         pace = Pace(sum(self._plan.seconds(one, rows) for one in self._plan.experiments))
-        every: list[tuple[Work, str]] = []
+        by_lanes: dict[int, list[tuple[Work, str]]] = {}
         for experiment in self._plan.experiments:
             works = self._plan.works(experiment, rows)
-            placed = [(work, f"{number} of {len(works)}") for number, work in enumerate(works, 1)]
             if not works:
                 self._say(f"{experiment.name}: all runs are done")
-            if self._plan.options.quick:
-                every += placed
-            else:
-                await self._do_together(placed, self._plan.at_once(experiment), pace)
-        # Those of all experiments, the longest first: none is left over at the end, alone.
-        every.sort(key=lambda one: -self._plan.run_seconds(one[0]))
-        await self._do_together(every, QUICK_AT_ONCE, pace)
+            placed = ((work, f"{number} of {len(works)}") for number, work in enumerate(works, 1))
+            by_lanes.setdefault(self._plan.at_once(experiment), []).extend(placed)
+        for at_once, all_works in sorted(by_lanes.items()):
+            all_works.sort(key=self._order)
+            await self._do_together(all_works, at_once, pace)
+
+    def _order(self, placed: tuple[Work, str]) -> float:
+        """Return the place of a run among those of all experiments.
+
+        Round by round: what changes slowly, such as the load of a computer's neighbours, then meets all
+        experiments, and shows in the intervals. Quickly, the longest first: none is left over at the end.
+        """
+        work, _ = placed
+        return -self._plan.run_seconds(work) if self._plan.options.quick else work.run.number
 
     async def _do_together(self, works: list[tuple[Work, str]], at_once: int, pace: Pace) -> None:
         """Do runs, some of them at the same time."""

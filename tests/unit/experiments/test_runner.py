@@ -86,8 +86,13 @@ def runner(
     wall: Callable[[], float] = time.time,
 ) -> Runner:
     if not (folder / TABLE).exists():
-        write_rows(folder / TABLE, [Row(link_condition(one), 1, "rate", 1.0, "bit/s") for one in USUAL_LINKS])
+        write_link(folder)
     return Runner(Plan([dice], options, runs, seed), folder, said.append, wall=wall)
+
+
+def write_link(folder: Path) -> None:
+    """Write what was measured of the links before."""
+    write_rows(folder / TABLE, [Row(link_condition(one), 1, "rate", 1.0, "bit/s") for one in USUAL_LINKS])
 
 
 class Dialled(Dice):
@@ -237,6 +242,25 @@ class Meeting(Dice):
             await self.met.wait()
         self.under_way -= 1
         return trial.measured([Value(f"eyes{number}", 1.0, "") for number in range(9)])
+
+
+async def test_each_round_has_runs_of_all_experiments(tmp_path: Path) -> None:
+    """What changes in the hours of a plan meets all of them."""
+    thrown: list[str] = []
+
+    class Second(Dice):
+        name = "coins"
+
+        async def measure(self, trial: Trial) -> list[Measured]:
+            thrown.append(self.name)
+            return await super().measure(trial)
+
+    class First(Second):
+        name = "dice"
+
+    write_link(tmp_path)
+    await Runner(Plan([First(), Second()], OPTIONS, RUNS, 1), tmp_path, print).run()
+    assert thrown == (["dice"] * 2 + ["coins"] * 2) * (1 + RUNS)
 
 
 class WaitingMeeting(Meeting):
