@@ -294,12 +294,17 @@ class Dispatcher:
     def _target_index(self, record: RobotRecord, granted: list[int]) -> int:
         """Return the index of the cell that a robot's move client drives it to; the last if it says none.
 
-        A robot that was pushed along its path drives back to that cell.
+        A robot that was pushed along its path drives back to that cell, or to the first one of its list if it
+        was pushed before its move client drove by that list.
         """
         report, last = record.report, len(granted) - 1
-        if report is None or report.state is not ClientState.DRIVING or report.target not in granted:
+        if report is None or record.pose_only:
             return last
-        return granted.index(report.target)
+        if report.state is ClientState.DRIVING:
+            return granted.index(report.target) if report.target in granted else last
+        if report.state is not ClientState.CANCELLING and report.revision == record.revision:
+            return last
+        return min(granted.index(report.reached) + 1, last) if report.reached in granted else 0
 
     def is_pushed(self, record: RobotRecord) -> bool:
         """Return whether a robot was pushed along its path, and cannot drive back within its cells.

@@ -98,9 +98,9 @@ class MakeBelieveRobot:
         reach = min(self.speed * pace * STEP, away)
         if away > 0:
             x, y = self.x + (goal_x - self.x) / away * reach, self.y + (goal_y - self.y) / away * reach
-            hit = self.grid.cells_touched(x, y, RADIUS) & boxes
-            if hit:
-                self.found |= hit
+            touched = self.grid.cells_touched(x, y, RADIUS)
+            self.found |= touched & boxes
+            if touched & (boxes | self.grid.blocked):
                 return self._end(GoalState.ABORTED)
             self.x, self.y = x, y
         return self._end(GoalState.SUCCEEDED) if reach == away else []

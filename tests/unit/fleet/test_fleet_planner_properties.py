@@ -103,6 +103,7 @@ def test_robots_stop_and_arrive_though_a_clock_jumps(
 @example(seed=900277, count=2, carries=True)  # a robot is pushed past the cell that it drives to
 @example(seed=3607634174, count=5, carries=True)  # a robot is carried into the way of another
 @example(seed=13712259, count=1, carries=True)  # a robot is pushed along its path, around a corner
+@example(seed=48155, count=2, carries=True)  # a robot is pushed along its path before it takes the list
 def test_indexes_equal_a_recomputation_whatever_happens(
     make_fleet: type[SimulatedClients], seed: int, count: int, carries: bool
 ) -> None:

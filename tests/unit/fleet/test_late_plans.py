@@ -109,10 +109,14 @@ def pair() -> PlannerHarness:
 
 
 def test_no_robot_is_granted_cells_while_a_plan_is_made(pair: PlannerHarness) -> None:
-    x, y = pair.planner.state.grid.centre(8)
+    ledger, (x, y) = pair.planner.state.ledger, pair.planner.state.grid.centre(8)
+    cells = tuple(ledger.granted("R1"))
+    pair.tell(
+        ReportSeen("R1", ClientReport(pair.revisions["R1"], ClientState.DRIVING, cells, target=cells[-1]))
+    )
     pair.tell(PoseSeen("R1", x, y, 0.0))
     pair.tell(Tick())
-    assert pair.planner.state.ledger.route("R1")[0] == 8
+    assert ledger.route("R1")[0] == 8
     assert pair.sent == {}
     pair.finish()
     assert len(pair.sent["R1"]) == len(pair.sent["R2"]) == 5
