@@ -98,12 +98,14 @@ class MasterUnreachableError(MasterError):
     Attributes:
         uri: The master's URI.
         reason: Why there is no answer.
+        is_late: Whether it did not come in time: the master may only be busy.
     """
 
-    def __init__(self, uri: str, reason: str) -> None:
+    def __init__(self, uri: str, reason: str, *, is_late: bool = False) -> None:
         super().__init__(uri, reason)
         self.uri = uri
         self.reason = reason
+        self.is_late = is_late
 
     def __str__(self) -> str:
         return f"the ROS master at {self.uri} does not answer: {self.reason}"

@@ -19,21 +19,22 @@ class PassingMaster(Protocol):
 
 
 class HoldingMaster:
-    """Passes calls on to a core, but holds the registrations of one name.
+    """Passes calls on to a core, but holds those of one kind for one name.
 
     Args:
         core_uri: The core.
-        name: The topic or service.
+        name: The topic, service or parameter.
+        method: Beginning of the methods that are held.
 
     Attributes:
         uri: Where it is served, if the test notes it here.
         calls: The methods that were called with this name, in the order in which they were answered.
-        held: How many registrations are held.
-        refuses: Whether registrations of the name are refused.
+        held: How many calls are held.
+        refuses: Whether held calls are refused.
         failures: How many of the calls that unregister the name are not carried out.
     """
 
-    def __init__(self, core_uri: str, name: str) -> None:
+    def __init__(self, core_uri: str, name: str, method: str = "register") -> None:
         self.uri = ""
         self.calls: list[str] = []
         self.held = 0
@@ -41,6 +42,7 @@ class HoldingMaster:
         self.failures = 0
         self._core_uri = core_uri
         self._name = name
+        self._method = method
         self._released = threading.Event()
 
     def release(self) -> None:
@@ -49,7 +51,7 @@ class HoldingMaster:
 
     def _dispatch(self, method: str, arguments: tuple[Any, ...]) -> Any:
         concerns = len(arguments) > 1 and arguments[1] == self._name
-        if concerns and method.startswith("register"):
+        if concerns and method.startswith(self._method):
             self.held += 1
             self._released.wait(60)
             self.held -= 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rce.ros.errors import MasterRefusedError, MasterUnreachableError, XmlRpcError
+from rce.ros.errors import MasterRefusedError, MasterUnreachableError, RpcTimeoutError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import SUCCESS
@@ -40,7 +40,8 @@ class MasterClient:
             answer = await self.rpc.send(self.uri, method, document, timeout=self.timeout)
             status, text, value = answer
         except XmlRpcError as error:
-            raise MasterUnreachableError(self.uri, str(error)) from error
+            is_late = isinstance(error, RpcTimeoutError)
+            raise MasterUnreachableError(self.uri, str(error), is_late=is_late) from error
         except (TypeError, ValueError) as error:
             raise self._unknown_form(method) from error
         if status != SUCCESS:

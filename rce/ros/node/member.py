@@ -26,7 +26,7 @@ from rce.ros.node.loggers import Loggers
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.registrar import Registrar
-from rce.ros.node.registrations import Registrations
+from rce.ros.node.registrations import BUSY_S, Registrations
 from rce.ros.node.running import stop_signals
 from rce.ros.node.runtime import Runtime, Types
 from rce.ros.node.service import SerializedHandler, Service
@@ -312,12 +312,14 @@ class GraphMember:
     async def _until_master_answers(self) -> None:
         """Ask the master, which may not be up yet, whether time is simulated."""
         loop = asyncio.get_running_loop()
-        deadline = None if self._master_timeout is None else loop.time() + self._master_timeout
+        began, timeout = loop.time(), self._master_timeout
         while True:
             try:
                 self._clock.simulated = await self._parameters.get(clock.PARAMETER, default=False) is True
             except MasterUnreachableError as error:
-                if deadline is not None and loop.time() >= deadline:
+                # One that is busy is there: other nodes of the robot start now, too.
+                limit = max(timeout, BUSY_S) if timeout and error.is_late else timeout
+                if limit is not None and loop.time() - began >= limit:
                     raise
                 _log.info("%s; trying again", error)
                 await asyncio.sleep(RETRY)

@@ -77,6 +77,8 @@ class Node(GraphMember):
             signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
                 which is the one that takes the program's command line.
             master_timeout: Seconds to wait for a master that is not up yet; ``None`` waits without a limit.
+                One that takes the request but is too busy to answer is waited for up to a minute, unless this
+                is 0.
             intra_process: Take messages of other nodes of this process as the objects that they published,
                 which then must not be changed; else by a connection, as from any node.
             rosout: Publish the log on ``/rosout``.

@@ -16,6 +16,9 @@ _log = logging.getLogger(__name__)
 RETRY = Backoff(first=0.2, longest=15.0, jitter=0.5)
 """Pauses between attempts to take back a registration that nothing needs."""
 
+BUSY_S = 60.0
+"""For how long a master that does not answer in time is asked again, by a node that starts or registers."""
+
 MasterCall = Callable[[], Awaitable[object]]
 
 
@@ -160,12 +163,21 @@ class Registration:
                 self._is_taken_back = True
 
     async def _register(self, register: MasterCall) -> Exception | None:
-        """Return the error instead of raising it: every handle gets it, and the node continues."""
+        """Return the error instead of raising it: every handle gets it, and the node continues.
+
+        A master that is busy is asked again, which does no harm if it has carried the call out.
+        """
+        loop = asyncio.get_running_loop()
         async with self._lock:
-            if not self._is_needed():
-                return None
-            try:
-                await register()
-            except Exception as error:  # noqa: BLE001 - raised by wait()
-                return error
+            deadline = loop.time() + BUSY_S
+            while self._is_needed():
+                try:
+                    await register()
+                except Exception as error:  # noqa: BLE001 - raised by wait()
+                    is_late = isinstance(error, MasterUnreachableError) and error.is_late
+                    if not is_late or loop.time() >= deadline:
+                        return error
+                    _log.info("%s: %s; trying again", self.subject, error)
+                else:
+                    break
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partialmethod
 from typing import Any
 
 import pytest
@@ -12,7 +13,8 @@ from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterRefusedError, MasterUnreachableError
-from rce.ros.node import Node, Publisher, Subscriber
+from rce.ros.node import Node, Publisher, Subscriber, registrations
+from rce.ros.node.master import MasterClient
 
 STRING = "std_msgs/String"
 
@@ -138,6 +140,55 @@ async def test_close_that_the_master_missed_is_repeated(core: Core, master: Hold
             await handle.close()
         await until_called(master, [f"register{kind}", f"unregister{kind}"])
         assert "/t" not in names(core)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes wait for a tenth of a second for each answer of their master."""
+    create = MasterClient.__init__
+    monkeypatch.setattr(MasterClient, "__init__", partialmethod(create, timeout=0.1))
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("kind", KINDS)
+async def test_busy_master_is_asked_again(core: Core, master: HoldingMaster, kind: str) -> None:
+    """As one whose robot starts all its nodes at once: a node that gave up would be missing."""
+    async with asyncio.timeout(60), node_at(master) as node:
+        task = await begin(KINDS[kind], node, master)
+        while master.held < 3:
+            await asyncio.sleep(0.01)
+        master.release()
+        await task
+        assert "/t" in names(core)
+        assert f"unregister{kind}" not in master.calls
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_master_that_is_busy_for_long_is_given_up(
+    master: HoldingMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registrations, "BUSY_S", 0.5)
+    async with asyncio.timeout(60), node_at(master) as node:
+        with pytest.raises(MasterUnreachableError, match=r"took longer than 0\.1 s"):
+            await node.advertise("/t", STRING)
+        master.release()
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_node_that_starts_waits_for_a_busy_master(core: Core) -> None:
+    """Longer than for one that is not up, which its user would wait for in vain."""
+    master = HoldingMaster(core.uri, "/use_sim_time", method="getParam")
+    with serving(master) as master.uri:
+        node = Node(
+            "a", argv=[], master_uri=master.uri, master_timeout=0.2, intra_process=False, signals=False
+        )
+        async with asyncio.timeout(60):
+            start = asyncio.ensure_future(node.__aenter__())
+            while master.held < 4:
+                await asyncio.sleep(0.01)
+            master.release()
+            await start
+            await node.__aexit__(None, None, None)
 
 
 @pytest.mark.parametrize("kind", KINDS)
