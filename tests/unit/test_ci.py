@@ -42,15 +42,25 @@ def test_packages_that_tests_need_are_in_the_list() -> None:
     assert named - {"..."} <= listed
 
 
-def run_ci(folder: Path, lint: int, docs: int, loops: int, tests: int) -> subprocess.CompletedProcess[str]:
+def run_ci(
+    folder: Path,
+    lint: int,
+    docs: int,
+    loops: int,
+    tests: int,
+    *,
+    packages: str = "dpkg",
+    path: str = os.environ["PATH"],
+) -> subprocess.CompletedProcess[str]:
     """Run ``.ci/run`` where ``make`` only notes what it is asked for."""
     (folder / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
-    (folder / ".ci" / "packages.txt").write_text("# none\n\ndpkg  # is everywhere\n")
+    (folder / ".ci" / "packages.txt").write_text(f"# none\n\n{packages}  # why\n")
     rules = "{0}:\n\t@echo {0} >> asked; exit {1}\n"
     ends = {"packages": 0, "lint": lint, "docs": docs, "install": loops, "collect": 0, "test-all": tests}
     (folder / "Makefile").write_text("".join(rules.format(name, code) for name, code in ends.items()))
     environ = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    environ["PATH"] = path
     return subprocess.run(
         [folder / ".ci" / "run"], env=environ, capture_output=True, text=True, timeout=60, check=False
     )
@@ -70,6 +80,23 @@ def test_any_failure_fails_the_run_and_nothing_runs_twice(
     assert sorted(asked) == ["collect", "docs", "install", "lint", "packages", "test-all"]
     asked.remove("lint")  # it runs beside the others
     assert asked == ["packages", "docs", "install", "collect", "test-all"]
+
+
+@pytest.mark.skipif(shutil.which("dpkg-query") is None, reason=".ci/run is for Debian")
+@pytest.mark.parametrize("code", [0, 7])
+def test_debian_packages_are_installed_beside_the_others(tmp_path: Path, code: int) -> None:
+    """What needs them waits, and a failure fails the run."""
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    wait = f"until grep -q packages {tmp_path}/asked; do sleep 0.05; done"
+    end = f"{wait}; echo installed >>{tmp_path}/asked; exit {code}"
+    for name, text in (("sudo", 'exec "$@"'), ("apt-get", f"case $1 in install) {end};; esac")):
+        (tools / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tools / name).chmod(0o755)
+    done = run_ci(tmp_path, 0, 0, 0, 0, packages="rce-no-such-package", path=f"{tools}:{os.environ['PATH']}")
+    assert (done.returncode == 0) == (code == 0), done
+    asked = (tmp_path / "asked").read_text().split()
+    assert asked.index("installed") < asked.index("test-all")
 
 
 def test_random_moments_are_as_many_as_asked() -> None:
