@@ -18,7 +18,7 @@ from rce_master.store.etcd.layout import MAX_OPERATIONS
 from support.engine import until
 from support.go_between import LOOPBACK, GoBetween
 from support.ports import free_ports
-from support.processes import finish
+from support.processes import finish, suspend
 
 START_S = 120.0
 OK = 200
@@ -51,7 +51,10 @@ class Member:
 
     def send(self, number: signal.Signals) -> None:
         assert self.process is not None
-        self.process.send_signal(number)
+        if number is signal.SIGSTOP:
+            suspend(self.process.pid)
+        else:
+            self.process.send_signal(number)
 
     async def end(self) -> None:
         if self.process is not None:

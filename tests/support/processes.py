@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -16,6 +17,23 @@ from rce.ros.core import Core
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "ros"
 TIMEOUT_S = 60.0
+
+
+def suspend(pid: int) -> None:
+    """Suspend a process by SIGSTOP, and wait until its threads stand: on a busy machine they run on."""
+    os.kill(pid, signal.SIGSTOP)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not all(_is_suspended(thread) for thread in Path(f"/proc/{pid}/task").iterdir()):
+        assert time.monotonic() < deadline, f"process {pid} is not suspended"
+        time.sleep(0.005)
+
+
+def _is_suspended(thread: Path) -> bool:
+    try:
+        state = (thread / "stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:  # it has ended
+        return True
+    return state in "TtZ"
 
 
 async def finish(
