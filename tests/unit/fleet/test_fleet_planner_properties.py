@@ -290,7 +290,8 @@ def disturb(fleet: SimulatedClients, rng: Random, *, carries: bool, what: int = 
 def lose(fleet: SimulatedClients, robot: str, what: int) -> None:
     """Let a robot or its move client fall silent or be heard again, restart that, or take the robot away."""
     if what == 14:
-        fleet.silent ^= {robot}
+        if robot in fleet.silent or fleet.planner.state.ledger.length(robot):  # others do not know it before
+            fleet.silent ^= {robot}
     elif what == 21:
         fleet.mute ^= {robot}
     elif what == 15:
