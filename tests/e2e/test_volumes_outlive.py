@@ -6,12 +6,14 @@ import json
 import os
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.container_nodes import NODES
 from support.engine import Engine, running_engine, until
+from support.short_folders import TMP
 
 from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import ApiError
@@ -28,7 +30,7 @@ def packages(tmp_path: Path) -> Path:
     nodes.mkdir(parents=True)
     (nodes / "keep.py").write_text(NODES["keep.py"])
     (nodes.parent / "package.yaml").write_text("name: own\n")
-    for path in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+    for path in takewhile(TMP.__ne__, (tmp_path, *tmp_path.parents)):
         path.chmod(0o755)  # nodes are another user
     return tmp_path / "packages"
 
