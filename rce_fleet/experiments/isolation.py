@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.systems.base import RunningWorkload, System
 
 AT_ONCE = 4
-"""The same comes out each time, unless something goes wrong."""
+"""Runs wait for programs to start, and only count."""
 SECONDS = 8.0
 PATIENCE_S = 30.0
 POLL_S = 0.2

@@ -41,12 +41,14 @@ class Robot(CommandSource):
     Attributes:
         offered: The topics; others can be added.
         got: Topic and content of each message.
+        asked: How often the station asked for a topic.
         used: The topics that the station uses.
         takes: What takes the robot's answers.
     """
 
     def __init__(self, *offered: RobotCommand) -> None:
         self.offered = offered
+        self.asked = 0
         self.got: list[tuple[str, dict[str, Any]]] = []
         self.used: list[str] = []
         self.takes: list[Take] = []
@@ -65,6 +67,7 @@ class Robot(CommandSource):
             self.used.remove(answer.topic)
 
     def _use(self, command: RobotCommand) -> None:
+        self.asked += 1
         if command not in self.offered:
             raise CommandError(f"no {command.topic}")
         self.used.append(command.topic)
@@ -99,11 +102,13 @@ async def test_a_topic_that_is_offered_later_is_measured(monkeypatch: pytest.Mon
     monkeypatch.setattr(velocity_sender_module, "TRY_AGAIN_S", 0.01)
     robot = Robot(VELOCITY)
     async with velocity_sender(RobotControl(robot, list), "Robot1") as sender:
-        for more in (DRIVE_ECHO, DRIVE_CLOCK):
-            await asyncio.sleep(0.05)
-            assert sender.clock is None
-            robot.offered += (more,)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
+            for more in (DRIVE_ECHO, DRIVE_CLOCK):
+                before = robot.asked
+                while robot.asked < before + 4:
+                    await asyncio.sleep(0.01)
+                assert sender.clock is None
+                robot.offered += (more,)
             while sender.clock is None:
                 await asyncio.sleep(0.01)
         sender.send(0.2, 0.1)
