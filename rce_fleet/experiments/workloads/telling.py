@@ -2,6 +2,9 @@
 
 A line is ``ready``, or ``report`` and a JSON object; all other lines are messages that were printed. The
 output is the one way by which a program in a container tells something without using the network measured.
+
+Standard error may be the same file, where libraries write a line and its end one after the other, so what is
+told begins with a line end of its own.
 """
 
 from __future__ import annotations
@@ -25,13 +28,13 @@ _LOCK = threading.Lock()
 
 def tell_ready() -> None:
     """Tell that the program has heard of all others, and when: seconds since 1970."""
-    _write(f"{READY}\n")
+    _write(f"\n{READY}\n")
     tell({READY: time.time()})
 
 
 def tell(report: dict[str, Any]) -> None:
     """Tell a report."""
-    _write(f"{REPORT}{json.dumps(report)}\n")
+    _write(f"\n{REPORT}{json.dumps(report)}\n")
 
 
 def tell_samples(phase: str, topic: str, samples: list[tuple[int, ...]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -125,7 +126,7 @@ def test_a_listener_is_ready_when_it_has_heard_all_and_tells_when_all_have_ended
     listener.take("/b", message(6 * SEC, f"1/{PRINTED}"))
     out = capsys.readouterr().out
     assert "frame_id='1/printed'" in out
-    *printed, ready, report = out.splitlines()
+    *printed, ready, report = filter(None, out.splitlines())
     assert printed[-1] == "---"
     assert ready == READY
     assert abs(next(reports([report]))[READY] - time.time()) < SEC
@@ -193,6 +194,25 @@ def test_lines_of_threads_do_not_mix(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = slow.getvalue().splitlines()
     assert lines.count(READY) == 100
     assert {report["number"] for report in reports(lines) if READY not in report} == set(range(100))
+
+
+def test_a_report_is_read_after_half_a_line_on_standard_error(tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "from rce_fleet.experiments.workloads.telling import tell, tell_ready\n"
+        "sys.stderr.write('unable to contact master')\n"
+        "tell({'number': 1})\n"
+        "sys.stderr.write('service unavailable')\n"
+        "tell_ready()\n"
+    )
+    output = tmp_path / "both.log"
+    with output.open("ab") as file:
+        subprocess.run(
+            [sys.executable, "-u", "-c", program], check=True, stdout=file, stderr=subprocess.STDOUT
+        )
+    lines = output.read_text().splitlines()
+    assert READY in lines
+    assert [report for report in reports(lines) if READY not in report] == [{"number": 1}]
 
 
 def test_scans_have_the_kinects_rays_and_differ() -> None:

@@ -61,15 +61,15 @@ inline void put(const std::string& lines) {
   std::fflush(stdout);
 }
 
-// Tells a report: the members of a JSON object.
-inline void tell(const std::string& members) { put("report {" + members + "}\n"); }
+// Tells a report: the members of a JSON object. It begins a new line, as standard error may be the same file.
+inline void tell(const std::string& members) { put("\nreport {" + members + "}\n"); }
 
 inline void tell_end() { tell("\"phase\": \"end\""); }
 
 inline void tell_ready() {
   std::array<char, 64> report;
   std::snprintf(report.data(), report.size(), "\"ready\": %.6f", static_cast<double>(now_us()) * 1e-6);
-  put("ready\n");
+  put("\nready\n");
   tell(report.data());
 }
 
