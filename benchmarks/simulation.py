@@ -26,7 +26,8 @@ from rce_fleet.drivers.robot_models import load_model
 from rce_fleet.drivers.runner import WorldRunner
 from rce_fleet.geometry.poses import Twist
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.simulation.world import World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import WorldSpec
 
 Rows = list[dict[str, Any]]
 

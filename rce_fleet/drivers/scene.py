@@ -33,11 +33,12 @@ from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
-from rce_fleet.simulation.box import BoxSpec
+from rce_fleet.simulation.box import BoxSpec, cell_of_box
 from rce_fleet.simulation.light.robots import TIME_STEP
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
 from rce_fleet.simulation.walls import Walls, grid_walls
-from rce_fleet.simulation.world import Dock, World, WorldSpec, cell_of_box
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import Dock, WorldSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -23,9 +23,8 @@ from rce_fleet.drivers.scene_items import Place, RobotStart, Size
 from rce_fleet.exceptions import FleetError
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.geometry.poses import Pose, Twist
-from rce_fleet.simulation.box import BoxSpec
+from rce_fleet.simulation.box import BoxSpec, cell_of_box
 from rce_fleet.simulation.walkers import WalkerSpec
-from rce_fleet.simulation.world import cell_of_box
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher

@@ -1,7 +1,8 @@
-"""Boxes that come and go."""
+"""Boxes that come and go, and the names of those in cells."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING
@@ -10,6 +11,10 @@ from rce_fleet.simulation.walls import Block
 
 if TYPE_CHECKING:
     from rce_fleet.geometry.poses import Pose
+
+_CELL = "cell_"
+"""Beginning of the name of a cell's box."""
+_CELL_BOX = re.compile(rf"{_CELL}(0|[1-9][0-9]{{0,8}})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,3 +53,14 @@ class BoxSpec:
         """Return whether it is to be there at a time, seconds."""
         moment = now % self.period if self.period else now
         return self.first <= moment + 1e-9 < self.last
+
+
+def box_of_cell(cell: int) -> str:
+    """Return the name of a cell's box."""
+    return f"{_CELL}{cell}"
+
+
+def cell_of_box(name: str) -> int | None:
+    """Return the cell whose box has this name; None for other boxes."""
+    found = _CELL_BOX.fullmatch(name)
+    return None if found is None else int(found[1])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from math import atan2, cos, sin
+from math import atan2, cos, inf, sin
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from rce_fleet.geometry.angles import wrap
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
 
     import pymunk
 
+    from rce_fleet.simulation.lidar import Floats
     from rce_fleet.simulation.robot import SimulatedRobot
 
 MOVES_TOWARDS = 0.01
@@ -113,3 +116,16 @@ class ContactWatch:
             if robot is not None:
                 found.append((robot, other))
         return found
+
+
+def separation(places: Floats) -> float:
+    """Return the smallest distance between the hulls of two robots, metres; ``inf`` with fewer than two.
+
+    Args:
+        places: x, y and radius of each robot, shape (N, 3), metres.
+    """
+    middles, radii = places[:, :2], places[:, 2]
+    apart = np.hypot(*(middles[:, None, :] - middles[None, :, :]).transpose(2, 0, 1))
+    apart -= radii[:, None] + radii[None, :]
+    np.fill_diagonal(apart, inf)
+    return float(apart.min(initial=inf))

@@ -6,8 +6,7 @@ to one thread. The caller decides how fast time advances.
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import hypot, inf
 from typing import TYPE_CHECKING
 
@@ -16,60 +15,29 @@ import pymunk
 
 from rce_fleet.exceptions import OccupiedError, PlaceTakenError
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.simulation.box import BoxSpec
-from rce_fleet.simulation.contacts import Collisions, ContactWatch, Kind
+from rce_fleet.simulation.box import BoxSpec, box_of_cell, cell_of_box
+from rce_fleet.simulation.contacts import Collisions, ContactWatch, Kind, separation
 from rce_fleet.simulation.doors import Door, DoorSpec
 from rce_fleet.simulation.lidar import Floats
 from rce_fleet.simulation.light.robots import LightRobots
-from rce_fleet.simulation.models import DISC, RobotModel
 from rce_fleet.simulation.robot import SimulatedRobot
 from rce_fleet.simulation.sensing import scan_all
 from rce_fleet.simulation.solids import Solids
 from rce_fleet.simulation.walkers import Walker, WalkerSpec
 from rce_fleet.simulation.walls import Block, Walls, grid_walls
+from rce_fleet.simulation.world_spec import WorldSpec
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.simulation.light.bodies import LightModel
+    from rce_fleet.simulation.models import RobotModel
 
 _OVERLAP = 0.002
 """How far things that touch may overlap, metres: so much that a contact that lasts is one contact."""
 _STANDS = 0.01
 """A slower robot stands, metres per second."""
-
-
-@dataclass(frozen=True, slots=True)
-class Dock:
-    """A place where standing robots are charged.
-
-    Attributes:
-        x: Its middle, metres.
-        y: Its middle, metres.
-        reach: How near a robot's middle must be, metres.
-    """
-
-    x: float
-    y: float
-    reach: float = 0.15
-
-
-@dataclass(frozen=True, slots=True)
-class WorldSpec:
-    """Properties of a world.
-
-    Attributes:
-        time_step: Length of a step, seconds.
-        box_size: Edge of the box in a cell, metres.
-        model: The model of robots that name none.
-        docks: Where robots are charged.
-    """
-
-    time_step: float = 0.02
-    box_size: float = 0.6
-    model: RobotModel = DISC
-    docks: tuple[Dock, ...] = field(default=())
 
 
 class World:
@@ -271,13 +239,13 @@ class World:
         x, y = self.grid.centre(cell)
         size = self.spec.box_size
         try:
-            self.put_box(f"{_CELL}{cell}", BoxSpec(Pose(x, y, self.grid.yaw), size, size))
+            self.put_box(box_of_cell(cell), BoxSpec(Pose(x, y, self.grid.yaw), size, size))
         except PlaceTakenError as error:
             raise OccupiedError(cell, error.things) from error
 
     def remove_box(self, cell: int) -> None:
         """Remove the box from a cell; do nothing if it has none."""
-        self.take_box(f"{_CELL}{cell}")
+        self.take_box(box_of_cell(cell))
 
     def put_box(self, name: str, box: BoxSpec) -> None:
         """Put a box somewhere, in place of the one of this name; if it is timed, now or when it is due.
@@ -466,12 +434,8 @@ class World:
             self.light.doors = [door.block for door in self._doors.values()]
             self.light.advance(dt)
             self.min_separation = self.light.judge.min_separation
-        elif len(self._robots) > 1:
-            places, radii = self._places[:, :2], self._places[:, 2]
-            apart = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))
-            apart -= radii[:, None] + radii[None, :]
-            np.fill_diagonal(apart, inf)
-            self.min_separation = min(self.min_separation, float(apart.min()))
+        else:
+            self.min_separation = min(self.min_separation, separation(self._places))
 
     def _note_places(self) -> None:
         """Note the robots' places and radii, shape (N, 3)."""
@@ -499,7 +463,7 @@ class World:
     def _docked(self, robot: SimulatedRobot) -> bool:
         x, y, _ = robot.place
         stands = abs(robot.wheels.wheels.speed) < _STANDS
-        return stands and any(hypot(dock.x - x, dock.y - y) <= dock.reach for dock in self.spec.docks)
+        return stands and any(dock.reaches(x, y) for dock in self.spec.docks)
 
     def _discs(self) -> list[tuple[str, float, float, float]]:
         """Return name, place and radius of all robots and walkers."""
@@ -533,14 +497,3 @@ class World:
         )
         if taken:
             raise PlaceTakenError(pose.x, pose.y, taken)
-
-
-_CELL = "cell_"
-"""Beginning of the name of a cell's box."""
-_CELL_BOX = re.compile(rf"{_CELL}(0|[1-9][0-9]{{0,8}})")
-
-
-def cell_of_box(name: str) -> int | None:
-    """Return the cell whose box has this name; None for other boxes."""
-    found = _CELL_BOX.fullmatch(name)
-    return None if found is None else int(found[1])

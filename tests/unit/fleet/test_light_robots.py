@@ -25,7 +25,8 @@ from rce_fleet.simulation.light.steering import Steering, limits_of
 from rce_fleet.simulation.models import RobotModel
 from rce_fleet.simulation.noise import EstimateSpec
 from rce_fleet.simulation.walls import Block, distances
-from rce_fleet.simulation.world import World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import WorldSpec
 
 NO_EDGES = np.empty((0, 4))
 SLIPLESS = DriveSpec(speed=0.65, turn_rate=3.0, acceleration=1.0, deceleration=2.0, turn_acceleration=4.0)

@@ -24,7 +24,8 @@ from rce_fleet.simulation.lidar import LidarSpec, cast
 from rce_fleet.simulation.models import RobotModel
 from rce_fleet.simulation.move_base import SimulatedMoveBase
 from rce_fleet.simulation.obstacles import blocked_cell, cells_ahead, clear_ahead, hit_points
-from rce_fleet.simulation.world import World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import WorldSpec
 
 NOTHING = np.empty((0, 2))
 

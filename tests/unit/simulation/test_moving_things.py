@@ -15,7 +15,8 @@ from rce_fleet.simulation.doors import DoorSpec
 from rce_fleet.simulation.drive import DriveSpec
 from rce_fleet.simulation.models import RobotModel
 from rce_fleet.simulation.walkers import WalkerSpec
-from rce_fleet.simulation.world import World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import WorldSpec
 
 
 def test_a_door_opens_and_closes_in_time() -> None:

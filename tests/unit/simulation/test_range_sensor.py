@@ -15,7 +15,8 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.lidar import Floats, LidarSpec, cast_many, measure
 from rce_fleet.simulation.models import RobotModel
-from rce_fleet.simulation.world import World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import WorldSpec
 
 CAMERA = LidarSpec(
     beams=160, field_of_view=radians(58), min_range=0.45, max_range=10.0, noise=0.0, x=0.1, y=-0.05, yaw=0.2

@@ -16,7 +16,8 @@ from rce_fleet.simulation.lidar import LidarSpec
 from rce_fleet.simulation.models import RobotModel
 from rce_fleet.simulation.noise import EstimateSpec
 from rce_fleet.simulation.odometry import STRIDE, STRIDE_TURN, Odometry, OdometrySpec
-from rce_fleet.simulation.world import Dock, World, WorldSpec
+from rce_fleet.simulation.world import World
+from rce_fleet.simulation.world_spec import Dock, WorldSpec
 
 STEP = 0.02
 
