@@ -305,9 +305,9 @@ class Runner:
         return self._prepared[experiment.name]
 
     async def _find(self, experiment: Experiment) -> dict[str, float]:
-        condition = Condition.of(experiment.name, NOT_ANY, NOT_ANY, part=PREPARED)
-        found = {row.metric: row.value for row in self.rows() if row.condition == condition}
         options = self._plan.options_of(experiment)
+        condition = Condition.of(experiment.name, NOT_ANY, options.software[0], part=PREPARED)
+        found = {row.metric: row.value for row in self.rows() if row.condition == condition}
         if not found and experiment.preparation_seconds(options):
             self._say(f"{experiment.name}: preparing")
             values, _ = await self._tried(

@@ -58,7 +58,7 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
 
     Args:
         folders: Have the raw data, ``results.csv``, and what they depend on, ``environment.json``. Each
-            experiment is in one of them.
+            experiment with one software is in one of them.
         page: The page that is written.
         figures: Folder for figures and ``summary.csv``; made if it does not exist.
         second: Folders with the raw data of another full run, or its ``summary.csv``, which is compared with
@@ -66,8 +66,8 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
 
     Raises:
         OSError: A file cannot be read or written.
-        ExperimentError: A file is not what it must be, or two folders have the same experiment; the text
-            names them.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment with the
+            same software; the text names them.
     """
     parts = read_parts(folders)
     measurements = Measurements.of(rows_of(parts))
@@ -90,7 +90,8 @@ def read_second(paths: Sequence[Path]) -> OtherRun:
 
     Raises:
         OSError: A file cannot be read.
-        ExperimentError: A file is not what it must be, or two folders have the same experiment.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment with the
+            same software.
     """
     files = [path for path in paths if path.is_file()]
     kept = [one for path in files for one in read_summary(path)]

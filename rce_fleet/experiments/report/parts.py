@@ -1,4 +1,4 @@
-"""The folders of raw data that a page is made of: each experiment is in one of them."""
+"""The folders of raw data that a page is made of: each experiment with one software is in one of them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments.experiment import NOT_ANY
 from rce_fleet.experiments.report.labels import number
 from rce_fleet.experiments.report.tables import markdown
 from rce_fleet.experiments.results import Row, read_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
 TABLE = "results.csv"
@@ -54,26 +55,44 @@ class Part:
     @property
     def experiments(self) -> list[str]:
         """Its experiments, in the order in which they were done."""
-        return list(dict.fromkeys(name for row in self.rows if (name := row.condition.experiment) != LINK))
+        return list(dict.fromkeys(experiment for experiment, _ in self.measured))
+
+    @property
+    def measured(self) -> list[tuple[str, str]]:
+        """Its experiments with the software of each, in the order in which they were done."""
+        pairs = ((row.condition.experiment, row.condition.software) for row in self.rows)
+        return list(
+            dict.fromkeys((experiment, software) for experiment, software in pairs if experiment != LINK)
+        )
+
+    def title(self, shared: Collection[str]) -> str:
+        """Return what it is called in a table: its experiments, those that are shared with their software."""
+        names = []
+        for experiment in self.experiments:
+            software = [name for one, name in self.measured if one == experiment and name != NOT_ANY]
+            names.append(f"{experiment} ({', '.join(software)})" if experiment in shared else experiment)
+        return ", ".join(names) or str(self.folder)
 
 
 def read_parts(folders: Sequence[Path]) -> list[Part]:
-    """Read folders that have different experiments.
+    """Read folders that have different experiments, or the same one with different software.
 
     Raises:
         OSError: A file cannot be read.
-        ExperimentError: A file is not what it must be, or two folders have the same experiment.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment with the same
+            software.
     """
-    found: dict[str, Path] = {}
+    found: dict[tuple[str, str], Path] = {}
     parts = [Part.read(folder) for folder in folders]
     for part in parts:
-        for experiment in part.experiments:
-            if experiment in found:
+        for measured in part.measured:
+            if measured in found:
+                experiment, software = measured
                 raise ExperimentError(
-                    f"the experiment {experiment} is in {found[experiment]} and in {part.folder}; a page is "
-                    "made of one of them, and --second compares two runs of it"
+                    f"the experiment {experiment} with the software {software} is in {found[measured]} and "
+                    f"in {part.folder}; a page is made of one of them, and --second compares two runs of it"
                 )
-            found[experiment] = part.folder
+            found[measured] = part.folder
     return parts
 
 
@@ -95,7 +114,9 @@ def environments_of(parts: Sequence[Part]) -> dict[str, Mapping[str, Any]]:
     """Return what rows depend on, by the experiments of each part; ``value`` if there is one part only."""
     if len(parts) == 1:
         return {"value": parts[0].environment} if parts[0].environment else {}
-    return {", ".join(part.experiments) or str(part.folder): part.environment for part in parts}
+    folders = Counter(experiment for part in parts for experiment in part.experiments)
+    shared = {experiment for experiment, count in folders.items() if count > 1}
+    return {part.title(shared): part.environment for part in parts}
 
 
 def environment_table(environments: Mapping[str, Mapping[str, Any]]) -> str:

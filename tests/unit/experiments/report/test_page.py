@@ -366,7 +366,26 @@ def test_page_of_several_folders_has_each_experiment_with_its_circumstances(
     assert link.rows[0]["runs"] == "6", "three of each folder"
 
 
+def test_page_has_the_software_of_each_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    folders = [tmp_path / "first", tmp_path / "further"]
+    for folder, software in zip(folders, (["ros", "rce"], ["roscpp"]), strict=True):
+        folder.mkdir()
+        kept = [one for one in example_rows(software) if one.condition.experiment in {"laser", "link"}]
+        write_rows(folder / "results.csv", kept)
+        (folder / "environment.json").write_text(json.dumps({"commit": software[0]}))
+    page = tmp_path / "page.md"
+    make_report(folders, page=page, figures=tmp_path / "page")
+    tables = list(tables_of(page.read_text(encoding="utf-8")))
+    (about,) = (one for one in tables if "what" in one.head)
+    assert about.head == ["what", "laser (ros, rce)", "laser (roscpp)"]
+    assert about.rows == [{"what": "commit", "laser (ros, rce)": "ros", "laser (roscpp)": "roscpp"}]
+    found = {row["software"] for one in tables if "software" in one.head for row in one.rows}
+    assert {"ROS", "ROS C++", "RCE"} <= found
+
+
 def test_folders_with_the_same_experiment_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match=r"the experiment robustness is in .*raw and in .*raw; "):
+    same = r"the experiment robustness with the software \w+ is in .*raw and in .*raw; "
+    with pytest.raises(ExperimentError, match=same):
         make_report([folder, folder], page=tmp_path / "page.md", figures=tmp_path / "figures")
     assert not (tmp_path / "page.md").exists()
