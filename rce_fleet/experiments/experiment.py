@@ -30,8 +30,6 @@ core does about an eighth of what a present server's core does; the second one a
 nodes that wait for each other. The machine that measures is not the one of the ratings: the share is an
 assumption, and 0.15 to 0.25 would be as good.
 """
-NOT_ANY = "-"
-"""System or software of a condition that has none."""
 
 
 class Link(NamedTuple):

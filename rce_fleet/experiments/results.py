@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+NOT_ANY = "-"
+"""System or software of a condition that has none."""
 COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
 
 

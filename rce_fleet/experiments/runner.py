@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, DELAY_S, RATE, SERVER, Bench
 from rce_fleet.experiments.clock_watch import ClockWatch
-from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Link, Options, Trial
-from rce_fleet.experiments.results import Condition, Row, error_text, read_rows, write_rows
+from rce_fleet.experiments.experiment import Experiment, Link, Options, Trial
+from rce_fleet.experiments.results import NOT_ANY, Condition, Row, error_text, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 from rce_fleet.experiments.systems.base import together
 from rce_fleet.experiments.systems.software import software_of

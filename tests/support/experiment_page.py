@@ -101,6 +101,8 @@ def cells_of_verdicts(page: str) -> Iterator[Cell]:
     (table,) = (table for table in tables_of(page) if "verdict" in table.head)
     experiments = experiments_of_claims(page)
     for line in table.rows:
+        if line["verdict"] == "**not measured**":
+            continue
         figures, case = case_of_figures(line["figures"])
         for part in figures.split("; "):
             found = re.fullmatch(r"`([^`]+)`: (.*\])(?: (.*))?", part)

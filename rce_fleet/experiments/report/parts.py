@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments.experiment import NOT_ANY
 from rce_fleet.experiments.report.labels import number
 from rce_fleet.experiments.report.tables import markdown
-from rce_fleet.experiments.results import Row, read_rows
+from rce_fleet.experiments.results import NOT_ANY, Row, read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
