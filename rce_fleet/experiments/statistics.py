@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from math import nan
+from math import nan, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -32,6 +32,21 @@ class Estimate(NamedTuple):
         """Return whether a value lies in the interval."""
         return isinstance(value, int | float) and self.low <= value <= self.high
 
+    def for_repeat(self, other_runs: int) -> Estimate:
+        """Return the same with the interval in which the median of other runs of the same thing is expected.
+
+        It is wider, by the square root of 1 + runs / other runs, because the other median varies too.
+
+        Source: P. Patil, R. D. Peng, J. T. Leek, "What should researchers expect when they replicate
+        studies? A statistical view of replicability in psychological science", 2016: the prediction interval.
+
+        Args:
+            other_runs: At least one.
+        """
+        wider = sqrt(1 + self.runs / other_runs)
+        low, high = (self.median + wider * (end - self.median) for end in (self.low, self.high))
+        return self._replace(low=low, high=high)
+
 
 def estimate(values: Sequence[float], *, seed: int = 0) -> Estimate:
     """Return the median of runs with its 95 % confidence interval, by the percentile bootstrap.
@@ -59,13 +74,21 @@ def estimate(values: Sequence[float], *, seed: int = 0) -> Estimate:
     return Estimate(median, float(low), float(high), len(sample))
 
 
-@cache
-def repeat_share(runs: int, other_runs: int) -> float:
-    """Return how often the median of other runs of the same thing lies in the interval of :func:`estimate`.
+class RepeatShares(NamedTuple):
+    """How often the median of other runs of the same thing lies in an interval."""
 
-    Less often than the true median does, because the other median varies too. It is simulated with normally
-    distributed values; other distributions give nearly the same, because both depend on the order of the
-    values only.
+    estimate: float
+    """In that of :func:`estimate`: less often than the true median, because the other median varies too."""
+    repeat: float
+    """In that of :meth:`Estimate.for_repeat`."""
+
+
+@cache
+def repeat_shares(runs: int, other_runs: int) -> RepeatShares:
+    """Return how often the median of other runs lies in the intervals if nothing differs but chance.
+
+    It is simulated with normally distributed values; for the interval of :func:`estimate`, other
+    distributions give nearly the same, because it depends on the order of the values only.
 
     Args:
         runs: Number of runs that the interval is of; at least three.
@@ -73,14 +96,17 @@ def repeat_share(runs: int, other_runs: int) -> float:
     """
     random = np.random.default_rng(0)
     tail = 50 * (1 - CONFIDENCE)
-    inside = 0
+    wider = sqrt(1 + runs / other_runs)
+    inside = np.zeros(2, np.int64)
     for _ in range(_BLOCKS):
         samples = random.standard_normal((_SIMULATED, runs))
         drawn = random.integers(0, runs, (_SIMULATED_RESAMPLES, runs))
-        low, high = np.percentile(np.median(samples[:, drawn], axis=2), [tail, 100 - tail], axis=1)
+        ends = np.percentile(np.median(samples[:, drawn], axis=2), [tail, 100 - tail], axis=1)
         others = np.median(random.standard_normal((_SIMULATED, other_runs)), axis=1)
-        inside += int(np.count_nonzero((low <= others) & (others <= high)))
-    return inside / (_BLOCKS * _SIMULATED)
+        medians = np.median(samples, axis=1)
+        for place, (low, high) in enumerate((ends, medians + wider * (ends - medians))):
+            inside[place] += np.count_nonzero((low <= others) & (others <= high))
+    return RepeatShares(*(inside / (_BLOCKS * _SIMULATED)).tolist())
 
 
 def effect_size(values: Sequence[float], others: Sequence[float]) -> float:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.report.drawing import Drawing
 
 SUMMARY = "summary.csv"
+SECOND = "second"
+"""Folder of the second run's summary, beside the first one's."""
 ENVIRONMENTS = "environments.json"
 """What the summary's raw data depend on, beside it."""
 NOT_MEASURED = "Not measured."
@@ -60,7 +62,8 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
         folders: Have the raw data, ``results.csv``, and what they depend on, ``environment.json``. Each
             experiment with one software is in one of them.
         page: The page that is written.
-        figures: Folder for figures and ``summary.csv``; made if it does not exist.
+        figures: Folder for figures and ``summary.csv``; made if it does not exist. Its folder ``second``
+            gets the ``summary.csv`` of the second run.
         second: Folders with the raw data of another full run, or its ``summary.csv``, which is compared with
             this one.
 
@@ -76,6 +79,10 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     write_summary(figures / SUMMARY, summarize(measurements))
     environments = environments_of(parts)
     write_environments(figures / ENVIRONMENTS, environments)
+    if again is not None:
+        (figures / SECOND).mkdir(exist_ok=True)
+        write_summary(figures / SECOND / SUMMARY, again.summary)
+        write_environments(figures / SECOND / ENVIRONMENTS, again.environments)
     drawings = figures_of(measurements)
     if drawing.can_draw():
         for one in (*schematics(), *(one for found in drawings.values() for one in found)):
@@ -99,7 +106,9 @@ def read_second(paths: Sequence[Path]) -> OtherRun:
     environments = environments_of(parts)
     for path in files:
         found = read_environments(path.parent / ENVIRONMENTS)
-        environments |= {f"{path.parent}: {name}": one for name, one in found.items()}
+        environments |= {
+            f"{path.parent}: {name}" if name in environments else name: one for name, one in found.items()
+        }
     return OtherRun(kept + summarize(Measurements.of(rows_of(parts))), environments)
 
 
@@ -137,7 +146,7 @@ def page_text(
         parts += [f"## {section.title}", f"Experiment `{section.experiment}`. {section.text}"]
         parts += _section(measurements, section.experiment, drawings.get(section.experiment, ()), figures)
     parts += ["## Other data", _other(measurements)]
-    parts += ["## Another full run", _repeated(measurements, environments, again)]
+    parts += ["## Another full run", _repeated(measurements, environments, again, figures)]
     parts += ["## Limits", limits()]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
@@ -207,17 +216,14 @@ def _other(measurements: Measurements) -> str:
 
 
 def _repeated(
-    measurements: Measurements, environments: Mapping[str, Mapping[str, Any]], again: OtherRun | None
+    measurements: Measurements,
+    environments: Mapping[str, Mapping[str, Any]],
+    again: OtherRun | None,
+    figures: str,
 ) -> str:
     if again is None:
         return NOT_MEASURED
+    where = f"Medians of the second run are in [{SECOND}/{SUMMARY}]({figures}/{SECOND}/{SUMMARY})."
     compared = comparison_text(compare(summarize(measurements), again.summary))
-    return "\n\n".join(filter(None, (_differences(environments, again.environments), compared)))
-
-
-def _differences(first: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return what differs between the runs, if each was made in one go."""
-    if len(first) != 1 or len(second) != 1:
-        return ""
-    (one,), (other,) = first.values(), second.values()
-    return differences_table(one, other)
+    differences = differences_table(environments, again.environments)
+    return "\n\n".join(filter(None, (where, differences, compared)))

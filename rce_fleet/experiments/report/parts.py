@@ -130,16 +130,21 @@ def environment_table(environments: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown(("what", *environments), rows)
 
 
-def differences_table(first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
-    """Return the table of what differs between what two runs depend on; empty if nothing is known to."""
+def differences_table(first: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the table of what differs between what two runs depend on; empty if nothing is known to.
+
+    Where a run was made in parts, it has all values that a part has.
+    """
     if not first or not second:
         return ""
-    rows = [
-        [name, *(_value(name, one.get(name, MISSING)) for one in (first, second))]
-        for name in dict.fromkeys((*first, *second))
-        if first.get(name) != second.get(name)
-    ]
+    names = dict.fromkeys(name for part in (*first.values(), *second.values()) for name in part)
+    found = ([name, *(_values(name, run) for run in (first, second))] for name in names)
+    rows = [row for row in found if row[1] != row[2]]
     return markdown(("what differs", "first run", "second run"), rows) if rows else ""
+
+
+def _values(name: str, parts: Mapping[str, Mapping[str, Any]]) -> str:
+    return "; ".join(dict.fromkeys(_value(name, part.get(name, MISSING)) for part in parts.values()))
 
 
 def write_environments(path: Path, environments: Mapping[str, Mapping[str, Any]]) -> None:

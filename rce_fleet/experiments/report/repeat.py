@@ -2,9 +2,11 @@
 
 Two runs of the same thing do not agree in 95 % of the medians: an interval contains the true median in 95 of
 100 experiments, but the second run's median varies too. How many lie in the interval depends on the number of
-runs (:func:`~rce_fleet.experiments.statistics.repeat_share`): some 83 % of large samples, 60 % of three runs.
+runs (:func:`~rce_fleet.experiments.statistics.repeat_shares`): some 83 % of large samples, 60 % of three.
 Source: G. Cumming, R. Maillardet, "Confidence intervals and replication: Where will the next mean fall?",
-2006. Therefore medians that are outside by little are counted apart.
+2006. Therefore two more shares are counted: of medians in the wider intervals in which another run's median
+is expected (:meth:`~rce_fleet.experiments.statistics.Estimate.for_repeat`), and of those that are outside by
+little.
 
 Metrics that have one value only within each of the two runs, such as losses of 0, say nothing about
 intervals: they do not count.
@@ -13,11 +15,11 @@ intervals: they do not count.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isnan
+from math import isnan, nan
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import condition_order
-from rce_fleet.experiments.statistics import repeat_share
+from rce_fleet.experiments.statistics import RepeatShares, repeat_shares
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -41,6 +43,11 @@ class Pair:
     def is_inside(self) -> bool:
         """Whether the second median lies in the first one's interval."""
         return self.second.estimate.median in self.first.estimate
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the second median lies where it is expected if nothing differs but chance."""
+        return self.second.estimate.median in self.first.estimate.for_repeat(self.second.estimate.runs)
 
     @property
     def change(self) -> float:
@@ -82,19 +89,25 @@ class Comparison:
     @property
     def inside(self) -> float:
         """Share of the second medians that lie in the first one's intervals."""
-        return sum(pair.is_inside for pair in self.pairs) / len(self.pairs) if self.pairs else float("nan")
+        return self._share(pair.is_inside for pair in self.pairs)
+
+    @property
+    def expected(self) -> float:
+        """Share of those that lie in the wider intervals of a repeat."""
+        return self._share(pair.is_expected for pair in self.pairs)
 
     @property
     def inside_or_near(self) -> float:
         """Share of those that lie in the intervals, or outside by little."""
-        near = sum(pair.is_inside or pair.is_near for pair in self.pairs)
-        return near / len(self.pairs) if self.pairs else float("nan")
+        return self._share(pair.is_inside or pair.is_near for pair in self.pairs)
 
     @property
-    def expected(self) -> float:
-        """Share that lies in the intervals if nothing differs but chance."""
-        runs = [(pair.first.estimate.runs, pair.second.estimate.runs) for pair in self.pairs]
-        return sum(repeat_share(*both) for both in runs) / len(runs) if runs else float("nan")
+    def by_chance(self) -> RepeatShares:
+        """Shares that lie in the two kinds of intervals if nothing differs but chance."""
+        shares = [repeat_shares(pair.first.estimate.runs, pair.second.estimate.runs) for pair in self.pairs]
+        return RepeatShares(
+            self._share(one.estimate for one in shares), self._share(one.repeat for one in shares)
+        )
 
     @property
     def same(self) -> int:
@@ -111,6 +124,9 @@ class Comparison:
         """What does not lie in the intervals, the largest change first."""
         found = (pair for pair in (*self.pairs, *self.constant) if not pair.is_inside)
         return sorted(found, key=lambda pair: -abs(pair.change))
+
+    def _share(self, counted: Iterable[float]) -> float:
+        return sum(counted) / len(self.pairs) if self.pairs else nan
 
     def experiments(self) -> Iterator[tuple[str, Comparison]]:
         """Yield the comparison of each experiment by itself."""

@@ -9,16 +9,18 @@ from rce_fleet.experiments.report.labels import (
     factors_label,
     interval,
     scale_for,
-    scaled,
     software_label,
     system_label,
 )
 from rce_fleet.experiments.report.repeat import GOAL, NEAR
 from rce_fleet.experiments.report.tables import MISSING, folded, markdown
-from rce_fleet.experiments.statistics import repeat_share
+from rce_fleet.experiments.statistics import repeat_shares
 
 if TYPE_CHECKING:
     from rce_fleet.experiments.report.repeat import Comparison, Pair
+
+CHANCE = "by chance"
+"""Column that tells whether chance alone can put a median there: whether it lies in the wider interval."""
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -27,7 +29,18 @@ def comparison_text(comparison: Comparison) -> str:
         return "Nothing can be compared: no metric has an interval in the first run and a second value."
     parts = [*filter(None, (_verdict(comparison), _constant(comparison))), _shares(comparison)]
     if comparison.outside:
-        head = ("experiment", "system", "software", "factors", "metric", "first", "second", "unit", "change")
+        head = (
+            "experiment",
+            "system",
+            "software",
+            "factors",
+            "metric",
+            "first",
+            "second",
+            "unit",
+            "change",
+            CHANCE,
+        )
         rows = [_row(pair) for pair in comparison.outside]
         parts.append(folded("Medians outside of the intervals", markdown(head, rows)))
     counts = {
@@ -42,15 +55,18 @@ def comparison_text(comparison: Comparison) -> str:
 def _verdict(comparison: Comparison) -> str:
     if not comparison.pairs:
         return ""
+    by_chance = comparison.by_chance
     reached = "reached" if comparison.reaches_goal else "not reached"
     return (
         f"Of {len(comparison.pairs)} medians of the second run, {_percent(comparison.inside)} lie in the "
-        f"intervals of the first one; the goal of {_percent(GOAL)} is {reached}. With those that are "
-        f"outside by {_percent(NEAR)} of the first median at most, it is "
-        f"{_percent(comparison.inside_or_near)}. If nothing differed but chance, some "
-        f"{_percent(comparison.expected)} would lie in the intervals, since the second medians vary too: "
-        f"{_percent(repeat_share(10, 10))} of those of ten runs, {_percent(repeat_share(3, 3))} of those of "
-        "three. Values over time are not counted."
+        f"intervals of the first one; the goal of {_percent(GOAL)} is {reached}. If nothing differed but "
+        f"chance, some {_percent(by_chance.estimate)} would, since the second medians vary too: "
+        f"{_percent(repeat_shares(10, 10).estimate)} of those of ten runs, "
+        f"{_percent(repeat_shares(3, 3).estimate)} of those of three. In intervals that allow for that, "
+        "which are wider (with as many runs in both by the square root of 2), lie "
+        f"{_percent(comparison.expected)}; by chance alone it would be some {_percent(by_chance.repeat)}. "
+        f"In the first one's intervals, or outside by {_percent(NEAR)} of the first median at most, lie "
+        f"{_percent(comparison.inside_or_near)}. Values over time are not counted."
     )
 
 
@@ -67,14 +83,16 @@ def _shares(comparison: Comparison) -> str:
     rows = [
         (
             *(name, str(len(part.pairs))),
-            *map(_percent, (part.inside, part.inside_or_near, part.expected)),
+            *map(_percent, (part.inside, part.by_chance.estimate, part.expected, part.by_chance.repeat)),
+            _percent(part.inside_or_near),
             f"{part.same} of {len(part.constant)}" if part.constant else MISSING,
         )
         for name, part in comparison.experiments()
     ]
     head = (
-        *("experiment", "medians", "in the intervals", f"or outside by {_percent(NEAR)} at most"),
-        *("in the intervals by chance alone", "constant, and the same"),
+        *("experiment", "medians", "in the intervals", "by chance alone", "in the wider ones"),
+        *("by chance alone", f"in the intervals, or outside by {_percent(NEAR)} at most"),
+        "constant, and the same",
     )
     return markdown(head, rows)
 
@@ -86,7 +104,8 @@ def _row(pair: Pair) -> list[str]:
     return [
         *(condition.experiment, system_label(condition.system), software_label(condition.software)),
         *(factors_label(condition.factors), f"`{pair.first.metric}`"),
-        *(interval(first, scale), scaled(second.median, scale), scale.unit, change),
+        *(interval(first, scale), interval(second, scale), scale.unit, change),
+        "possible" if pair.is_expected else "unlikely",
     ]
 
 

@@ -8,7 +8,7 @@ from rce_fleet.experiments.report.explanations import NETWORK
 from rce_fleet.experiments.report.judging import MIN_RATIO, SAME_RATIO
 from rce_fleet.experiments.report.measurements import Quantity
 from rce_fleet.experiments.report.tables import TableSpec
-from rce_fleet.experiments.statistics import CONFIDENCE, MIN_RUNS, RESAMPLES, repeat_share
+from rce_fleet.experiments.statistics import CONFIDENCE, MIN_RUNS, RESAMPLES, repeat_shares
 
 _CLIENT_NETWORK = Quantity("client.network_in", "+", "client.network_out")
 _PACKETS = tuple(
@@ -203,8 +203,8 @@ def limits() -> str:
 - The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
   verdict is about the versions above.
 - All runs of an experiment were made on one computer in one session: the intervals say how well it repeats
-  itself, not how other computers differ. Where nothing but chance differs,
-  some {100 * repeat_share(10, 10):.0f} % of the medians of another ten runs lie in the intervals; what
+  itself, not how other computers differ. Where nothing but chance differs, some
+  {100 * repeat_shares(10, 10).estimate:.0f} % of the medians of another ten runs lie in the intervals; what
   another full run found is told above.
 - Bootstrap intervals of ten runs are a little too narrow. Those of three runs reach from the least to the
   greatest value: such a range has the true median in 75 of 100 experiments, and the median of another three

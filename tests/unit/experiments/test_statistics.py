@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import bootstrap
 
-from rce_fleet.experiments.statistics import effect_size, estimate
+from rce_fleet.experiments.statistics import effect_size, estimate, repeat_shares
 
 
 def test_the_interval_is_that_of_scipy() -> None:
@@ -38,6 +38,28 @@ def test_the_interval_of_three_runs_is_their_range() -> None:
     found = [estimate(list(sample)) for sample in samples]
     assert [(one.low, one.high) for one in found] == [(min(sample), max(sample)) for sample in samples]
     assert sum(0.0 in one for one in found) / len(found) == pytest.approx(0.75, abs=0.06)
+
+
+def test_a_repeat_has_a_wider_interval() -> None:
+    """With as many runs by the square root of 2; the median of more runs varies less."""
+    found = estimate([1.0, 2.0, 4.0])
+    assert [*found.for_repeat(3)] == pytest.approx([2.0, 2 - 2**0.5, 2 + 2 * 2**0.5, 3])
+    assert found.for_repeat(1_000_000)[1:3] == pytest.approx((1.0, 4.0), rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", ["normal", "exponential", "uniform"])
+def test_a_repeat_is_found_as_often_as_told(draw: str) -> None:
+    random = np.random.default_rng(3)
+    samples = getattr(random, draw)(size=(300, 10))
+    others = np.median(getattr(random, draw)(size=(300, 10)), axis=1)
+    found = [estimate(list(sample)) for sample in samples]
+    pairs = list(zip(found, others, strict=True))
+    shares = repeat_shares(10, 10)
+    assert sum(other in one for one, other in pairs) / 300 == pytest.approx(shares.estimate, abs=0.07)
+    assert sum(other in one.for_repeat(10) for one, other in pairs) / 300 == pytest.approx(
+        shares.repeat, abs=0.07
+    )
 
 
 def test_few_runs_have_no_interval() -> None:

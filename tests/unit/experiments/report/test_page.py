@@ -243,8 +243,9 @@ def test_second_run_is_compared(rows: list[Row]) -> None:
     same = [row for row in rows if row.metric != "rain"]
     again = summarize(Measurements.of([*same, *changed]))
     text = page_text(Measurements.of(rows), {}, {}, "images", OtherRun(again, {}))
-    assert "| weather | 1 | 0 % | 0 % |" in text
-    assert "| weather | CRS | RCE | sky=blue | `rain` | 3.00 [2.70, 3.30] | 6.00 | mm | +100.0 % |" in text
+    assert "| weather | 1 | 0 % | 83 % | 0 % |" in text
+    both = "3.00 [2.70, 3.30] | 6.00 [5.40, 6.60]"
+    assert f"| weather | CRS | RCE | sky=blue | `rain` | {both} | mm | +100.0 % | unlikely |" in text
     assert "the goal of 90 % is reached" in text
 
 
@@ -278,12 +279,16 @@ def test_report_is_page_figures_and_summary(folder: Path, tmp_path: Path) -> Non
     text = page.read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert "images/experiments/robustness-ros.png" in links
-    assert len(links) == 1 + 2 * 4, "the summary, three set-ups and a figure, each as PNG and SVG"
+    assert len(links) == 2 + 2 * 4, "two summaries, three set-ups and a figure, each as PNG and SVG"
     assert all((page.parent / link).stat().st_size for link in links)
     assert "| memory_bytes | 4.00 GB |" in text
     assert "| options | quick no |" in text
     make_report([folder], page=page, figures=figures, second=[figures / "summary.csv"])
     assert page.read_text(encoding="utf-8") == text, "the summary is enough to compare with a run"
+    kept = figures / "second"
+    assert (kept / "summary.csv").read_bytes() == (figures / "summary.csv").read_bytes()
+    make_report([folder], page=page, figures=figures, second=[kept / "summary.csv"])
+    assert page.read_text(encoding="utf-8") == text, "and it is kept"
     assert "what differs" not in page.read_text()
     (figures / "environments.json").write_text('{"value": {"cores": 4}}')
     make_report([folder], page=page, figures=figures, second=[figures / "summary.csv"])
@@ -318,7 +323,7 @@ def test_a_second_run_in_parts_is_not_described_by_its_last_part(
         kept.append(figures / "summary.csv")
     page = tmp_path / "page.md"
     make_report([folder], page=page, figures=tmp_path / "figures", second=kept)
-    assert "| what differs |" not in page.read_text(encoding="utf-8")
+    assert "| cores | 2 | 2; 64 |" in page.read_text(encoding="utf-8")
     make_report([folder], page=page, figures=tmp_path / "figures", second=kept[1:])
     assert "| cores | 2 | 64 |" in page.read_text(encoding="utf-8")
 

@@ -121,6 +121,7 @@ def test_medians_of_a_second_run_are_counted() -> None:
     found = compare(summarize(first), summarize(second))
     assert found.inside == pytest.approx(1 / 3)
     assert found.inside_or_near == pytest.approx(2 / 3)
+    assert found.expected == pytest.approx(1 / 3)
     assert not found.reaches_goal
     assert [(pair.first.metric, pair.change) for pair in found.outside] == [
         ("lost", 1.0),
@@ -130,6 +131,16 @@ def test_medians_of_a_second_run_are_counted() -> None:
     assert [one.metric for one in found.only_first] == ["lost"]
     assert [one.metric for one in found.only_second] == ["delay_p50"]
     assert [name for name, _ in found.experiments()] == ["laser"]
+
+
+def test_what_chance_can_do_is_told() -> None:
+    """Three runs from 9 to 11, another three: the wider interval ends at 10 + sqrt(2)."""
+    first = summarize(Measurements.of(rows(SMS, "rate", [9.0, 10.0, 11.0])))
+    for rate, share, told in ((11.4, 1.0, "possible"), (11.5, 0.0, "unlikely")):
+        second = summarize(Measurements.of(rows(SMS, "rate", [8.0, rate, 13.0])))
+        found = compare(first, second)
+        assert (found.inside, found.expected) == (0.0, share)
+        assert f" % | {told} |" in comparison_text(found)
 
 
 def test_the_same_run_twice_reaches_the_goal() -> None:
@@ -156,12 +167,12 @@ def test_constant_metrics_are_counted_apart() -> None:
     found = compare(first, second)
     assert (len(found.pairs), len(found.constant), found.same, found.inside) == (1, 2, 1, 0.0)
     assert [pair.first.metric for pair in found.outside] == ["topics", "rate"]
-    assert found.expected == pytest.approx(0.6, abs=0.03)  # 3 of 5 orders of six values
+    assert found.by_chance.estimate == pytest.approx(0.6, abs=0.03)  # 3 of 5 orders of six values
     text = comparison_text(found)
     assert "2 metrics that had one value only in each run, such as losses of 0: 1 of them" in text
     constant = compare(first[:1], first[:1])
     assert (constant.pairs, constant.same) == ((), 1)
-    assert "| laser | 0 | - | - | - | 1 of 1 |" in comparison_text(constant)
+    assert "| laser | 0 | - | - | - | - | - | 1 of 1 |" in comparison_text(constant)
 
 
 @pytest.mark.parametrize(
