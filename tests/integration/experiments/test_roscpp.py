@@ -70,10 +70,11 @@ class Started:
     def messages(self) -> dict[tuple[str, ...], str]:
         """What was printed of each message, by its fields and stamp.
 
-        Sequence numbers are left out: a listener's begin when it was connected.
+        Sequence numbers are left out: a listener's begin when it was connected. So are empty lines: a report
+        begins with one.
         """
         left_out = (READY, REPORT, "  seq: ")
-        printed = [line for line in self.lines() if not line.startswith(left_out)]
+        printed = [line for line in self.lines() if line and not line.startswith(left_out)]
         *texts, _ = ("\n" + "\n".join(printed)).split("---")
         return {(*STAMP.findall(text), *FIELD.findall(text)): text for text in texts}
 
