@@ -329,7 +329,7 @@ def _bring_along(tx: Transaction, move: Move, unit: list[Container]) -> bool:
         if not why and not capacity.admission(tables, each)(move.to):
             why = "a container of its name is still ending there"
         if not why and not _takes_all(tables.rooms.get(move.to), late):
-            why = "there is no room for it"
+            why = "the machine lacks room"
         if why:
             give_up(tx, move, f"cannot move without container {each.tag!r}, which joined its group: {why}")
             return False

@@ -96,7 +96,7 @@ def test_a_group_stays_if_who_joins_it_has_no_room_there(grouped: World) -> None
     assert moves(grouped) == {}
     texts = [event.text for event in changes.events]
     assert (
-        "at c1: c4: it cannot move without container 'c', which joined its group: there is no room for it"
+        "at c1: c4: it cannot move without container 'c', which joined its group: the machine lacks room"
         in texts
     )
     assert [at(grouped, tag) for tag in "abc"] == ["c1", "c1", "c1"]
