@@ -395,7 +395,8 @@ class EtcdClient:
                                 told = [*reasons.values(), str(error)]
                                 raise EtcdAwayError(told, maybe_done=True) from error
                 except TimeoutError:
-                    waited = time.monotonic() - began
+                    # Another call that passes the member over ends this one before its limit.
+                    waited = min(time.monotonic() - began, limit)
                     reasons[used] = f"{endpoint}: no answer within {waited:.3g} s"
                     maybe_done = True
                 finally:
