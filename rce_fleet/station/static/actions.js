@@ -10,6 +10,9 @@ const ORDER = ["stops", "name", "rounds", "priority", "deadline", "when_late", "
 
 const REFUSED = [404, 409, 422]; // of one cell: others can be tried
 
+const CHANGED = 412; // since the revision that a change is for
+const CHANGE_TRIES = 5;
+
 // After these, or without any answer, a request may have been carried out.
 const UNANSWERED = [undefined, 502, 503, 504];
 const AGAIN_MS = [1000, 2000, 4000, 8000, 15000, 30000];
@@ -95,10 +98,15 @@ export class Actions {
       return ask("PATCH", `/tasks/${task}`, { priority });
     };
     // A task's revision also grows when robots get on with it, so undo compares what the operator changed.
-    const undo = async () => {
+    const undo = async (tries = CHANGE_TRIES) => {
       const now = await ask("GET", `/tasks/${task}`);
       if (now.priority !== priority) throw new Error(t("action.priority.other", { task, priority: now.priority }));
-      return ask("PATCH", `/tasks/${task}`, { priority: before }, ifMatch(now.revision));
+      try {
+        return await ask("PATCH", `/tasks/${task}`, { priority: before }, ifMatch(now.revision));
+      } catch (error) {
+        if (error.status !== CHANGED || tries === 1) throw error;
+        return undo(tries - 1);
+      }
     };
     return this.operator.act(t("action.priority.done", { task, priority }), run, undo);
   }

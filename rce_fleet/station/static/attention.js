@@ -2,7 +2,7 @@
 
 import { exceptionsOf, fleetConditionsOf, isPossible, loadCells, rowsOf, taskConditionsOf } from "./conditions.js";
 import { element } from "./engine.js";
-import { placeRows } from "./rows.js";
+import { isPressed, placeRows } from "./rows.js";
 import { t } from "./texts.js";
 
 const DRAW_EVERY_MS = 1000;
@@ -39,6 +39,7 @@ export class Attention {
   }
 
   draw() {
+    if (isPressed(this.list)) return;
     const whole = fleetConditionsOf(this.fleet);
     const found = exceptionsOf([...this.fleet.robots.values(), ...this.fleet.unknownUndelivered()]);
     const tasks = taskConditionsOf(this.work);

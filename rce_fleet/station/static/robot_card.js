@@ -2,6 +2,7 @@
 
 import { element } from "./engine.js";
 import { heartbeatAge, isOut, isPossible } from "./conditions.js";
+import { isPressed } from "./rows.js";
 import { t } from "./texts.js";
 
 const ANSWERS = ["drive", "localize", "charge", "reassign", "cancel"];
@@ -18,6 +19,7 @@ export class RobotCard {
   }
 
   draw() {
+    if (isPressed(this.box)) return;
     const robot = this.fleet.robots.get(this.fleet.selected);
     this.box.hidden = !robot || !this.steers;
     if (this.box.hidden) return;

@@ -3,6 +3,7 @@
 import { colourOf } from "./colours.js";
 import { TROUBLE, heartbeatAge } from "./conditions.js";
 import { element } from "./engine.js";
+import { isPressed } from "./rows.js";
 import { t } from "./texts.js";
 
 const DRAW_EVERY_MS = 250;
@@ -83,6 +84,7 @@ export class RobotsTable {
   }
 
   #drawRows() {
+    if (isPressed(this.body)) return;
     const first = Math.max(0, Math.floor(this.box.scrollTop / ROW_PX) - SPARE_ROWS);
     const count = Math.ceil((this.box.clientHeight || 400) / ROW_PX) + 2 * SPARE_ROWS;
     const ids = this.#order.slice(first, first + count).filter((id) => this.fleet.robots.has(id));

@@ -2,7 +2,7 @@
 
 import { clock, isAtRisk } from "./conditions.js";
 import { element } from "./engine.js";
-import { placeRows } from "./rows.js";
+import { isPressed, placeRows } from "./rows.js";
 import { t } from "./texts.js";
 import { ENDED } from "./work.js";
 
@@ -29,6 +29,7 @@ export class TasksPanel {
   }
 
   draw() {
+    if (isPressed(this.body)) return;
     const { work } = this;
     const open = [...work.tasks.values()].slice(0, MOST_OPEN);
     const tasks = [...open, ...work.recurring, ...work.recent.slice(0, 5)];

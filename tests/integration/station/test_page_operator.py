@@ -196,7 +196,7 @@ async def test_a_silent_robot_comes_first_with_its_answers() -> None:
 
 
 async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
-    """A press and its release hit the same button, and the focus stays, also in a row that is made again."""
+    """Nothing moves, or is made again, between a press and its release; the focus stays in one made again."""
     async with site() as made:
         page = await made.open()
 
@@ -210,9 +210,12 @@ async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
         await cancel.hover()
         await page.mouse.down()
         tell("Robot2", "silent")
-        await other.wait_for()
+        tell("Robot1", "stuck")
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').state === 'stuck'")
+        await page.evaluate("void rceFleet.fleet.dispatchEvent(new Event('planner'))")  # the list is drawn
         async with page.expect_response("**/robots/Robot1/goal"):
             await page.mouse.up()
+        await other.wait_for()
         tell("Robot1", "unreachable")  # again: the goal was removed
         await cancel.focus()
         tell("Robot2", "idle")
