@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
 
 STEP = 0.02
+MOST_AT_ONCE = 0.1
+"""Seconds that pass at once at most: a machine that is late must not drive the robot without its commands."""
 SENSE_EVERY = 0.1
 BEAMS = 180
 EDGE = 0.1
@@ -81,9 +83,12 @@ class RobotInWorld:
             data=picture.data.reshape(-1).tolist(),
         )
         loop = asyncio.get_running_loop()
-        began, sensed = loop.time(), -inf
+        last, due, sensed = loop.time(), 0.0, -inf
         while True:
-            while world.time < loop.time() - began:
+            now = loop.time()
+            due += min(now - last, MOST_AT_ONCE)
+            last = now
+            while world.time < due:
                 world.step(STEP)
             stamp = node.now()
             odom_from_base = self.map_from_odom.inverse().compose(world.pose)
