@@ -105,7 +105,7 @@ async def test_requests_of_robots(run_site: RunSite) -> None:
         answers = await asyncio.gather(*(create("anna", f"c{number}") for number in range(60)))
         refused = [error for reply in answers for error in reply.errors]
         assert {fault.code for reply in answers for fault in reply.faults} == {"busy"}
-        assert 30 <= len(refused) < 60
+        assert 0 < len(refused) < 60
         assert all("CC: too many requests" in error and "try again in" in error for error in refused)
         assert (await create("bert", "c")).errors == ()
 
