@@ -38,7 +38,7 @@ CHANGED_BEFORE = """() => {
 
 
 def refused(answer: Response) -> list[str]:
-    if answer.status < 400 or answer.status == CONFLICT:
+    if answer.status < 400 or (answer.request.method, answer.status) == ("PATCH", CONFLICT):
         return []
     return [f"{answer.request.method} {answer.url}: {answer.status}"]
 

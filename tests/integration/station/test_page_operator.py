@@ -195,41 +195,6 @@ async def test_a_silent_robot_comes_first_with_its_answers() -> None:
         )
 
 
-async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
-    """Nothing moves, or is made again, between a press and its release; the focus stays in one made again."""
-    async with site() as made:
-        page = await made.open()
-
-        def tell(name: str, robot_state: str) -> None:
-            made.feed.on_change(made.view.on_changes(changes(robot(name, state=robot_state, reason="why"))))
-
-        tell("Robot1", "unreachable")
-        cancel = page.locator("#attention-list button[aria-label$=': Robot1']", has_text="Cancel")
-        other = page.locator("#attention-list li", has_text="Robot2")
-        await cancel.scroll_into_view_if_needed()
-        await cancel.hover()
-        await page.mouse.down()
-        tell("Robot2", "silent")
-        tell("Robot1", "stuck")
-        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').state === 'stuck'")
-        await page.evaluate("void rceFleet.fleet.dispatchEvent(new Event('planner'))")  # the list is drawn
-        async with page.expect_response("**/robots/Robot1/goal"):
-            await page.mouse.up()
-        await other.wait_for()
-        tell("Robot1", "unreachable")  # again: the goal was removed
-        await cancel.focus()
-        tell("Robot2", "idle")
-        await other.wait_for(state="detached")
-        async with page.expect_response("**/robots/Robot1/goal"):
-            await page.keyboard.press("Enter")
-        tell("Robot1", "unreachable")
-        await cancel.focus()
-        made.feed.on_control({"Robot1": "an operator"}, {})
-        await page.locator("#attention-list button", has_text="Release").wait_for()
-        async with page.expect_response("**/robots/Robot1/goal"):
-            await page.keyboard.press("Enter")
-
-
 async def test_the_page_tells_that_the_planner_is_away() -> None:
     """Also a page that is opened later; what it shows is old."""
     async with site() as made:

@@ -1,0 +1,82 @@
+"""What is pressed on the page stays as it is until its release."""
+
+from __future__ import annotations
+
+import pytest
+from integration.station.test_page_operator import site
+from support.planner_states import changes, robot
+
+pytestmark = pytest.mark.needs("chromium")
+
+SEARCH = """() => {
+    const find = document.querySelector("#robots-find");
+    find.value = "robot";
+    find.dispatchEvent(new Event("input"));
+}"""
+"""Sort the table anew at once; all robots are found."""
+
+
+async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
+    """Nothing moves, or is made again, between a press and its release; the focus stays in one made again."""
+    async with site() as made:
+        page = await made.open()
+
+        def tell(name: str, robot_state: str) -> None:
+            made.feed.on_change(made.view.on_changes(changes(robot(name, state=robot_state, reason="why"))))
+
+        tell("Robot1", "unreachable")
+        cancel = page.locator("#attention-list button[aria-label$=': Robot1']", has_text="Cancel")
+        other = page.locator("#attention-list li", has_text="Robot2")
+        await cancel.scroll_into_view_if_needed()
+        await cancel.hover()
+        await page.mouse.down()
+        tell("Robot2", "silent")
+        tell("Robot1", "stuck")
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').state === 'stuck'")
+        await page.evaluate("void rceFleet.fleet.dispatchEvent(new Event('planner'))")  # the list is drawn
+        async with page.expect_response("**/robots/Robot1/goal"):
+            await page.mouse.up()
+        await other.wait_for()
+        tell("Robot1", "unreachable")  # again: the goal was removed
+        await cancel.focus()
+        tell("Robot2", "idle")
+        await other.wait_for(state="detached")
+        async with page.expect_response("**/robots/Robot1/goal"):
+            await page.keyboard.press("Enter")
+        tell("Robot1", "unreachable")
+        await cancel.focus()
+        made.feed.on_control({"Robot1": "an operator"}, {})
+        await page.locator("#attention-list button", has_text="Release").wait_for()
+        async with page.expect_response("**/robots/Robot1/goal"):
+            await page.keyboard.press("Enter")
+
+
+async def test_a_press_on_the_card_hits_its_button() -> None:
+    """Other buttons fit the robot before the release."""
+    async with site() as made:
+        page = await made.open()
+        await page.locator("tr[data-robot=Robot1]").click()
+        await page.locator("#robot-card button.stop").hover()
+        await page.mouse.down()
+        await page.evaluate("rceFleet.fleet.things.Robot1 = ['light']")
+        await page.evaluate("void rceFleet.fleet.dispatchEvent(new Event('selected'))")  # the card is drawn
+        async with page.expect_request("**/robots/Robot1/emergency-stop"):
+            await page.mouse.up()
+        await page.locator("#robot-card button", has_text="Localize").wait_for(state="detached")
+
+
+async def test_a_press_on_a_row_selects_its_robot() -> None:
+    """The table is sorted anew before the release: robots in trouble come first."""
+    async with site() as made:
+        page = await made.open()
+        await page.locator("tr[data-robot=Robot2]").hover()
+        await page.mouse.down()
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot2", state="silent"))))
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot2').state === 'silent'")
+        await page.evaluate(SEARCH)
+        await page.mouse.up()
+        await page.wait_for_function("rceFleet.fleet.selected !== null")
+        assert await page.evaluate("rceFleet.fleet.selected") == "Robot2"
+        await page.wait_for_function(
+            "document.querySelector('#robots tr[data-robot]').dataset.robot === 'Robot2'"
+        )
