@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import xmlrpc.client
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from socketserver import ThreadingMixIn
 from typing import Any, Protocol
 from xmlrpc.server import SimpleXMLRPCServer
@@ -72,15 +73,22 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     """Serves each connection in a thread: a node keeps one open to its master."""
 
 
-@contextmanager
-def serving(master: PassingMaster) -> Iterator[str]:
+@asynccontextmanager
+async def serving(master: PassingMaster) -> AsyncIterator[str]:
     """Serve a master; give its URI."""
-    with _Server(("127.0.0.1", 0), logRequests=False) as server:
-        server.register_instance(master)
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_address[1]}/"
-        finally:
-            server.shutdown()
-            thread.join()
+    server = _Server(("127.0.0.1", 0), logRequests=False)
+    server.register_instance(master)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+    finally:
+        # Not in the event loop: a call on its way waits for the core, which may be served by it.
+        await asyncio.to_thread(_end, server, thread)
+
+
+def _end(server: _Server, thread: threading.Thread) -> None:
+    """End a server, when it has answered what it was asked."""
+    server.shutdown()
+    thread.join()
+    server.server_close()

@@ -52,21 +52,23 @@ async def test_interface_registers_when_the_core_answers_again(spec: InterfaceSp
     """It stayed closed until its spec changed: a robot had no poses from then on."""
     async with Core(port=0) as core, asyncio.timeout(120):
         master = HoldingMaster(core.uri, "/held")
-        with serving(master) as uri:
-            async with Node("environment", argv=[], master_uri=uri, signals=False) as node:
-                node._running.master.timeout = 0.1
-                interface = make(node, spec)
-                start = asyncio.create_task(interface.start())
-                try:
-                    while master.held < 2 and not start.done():
-                        await asyncio.sleep(0.01)
-                    node._running.master.timeout = 60.0
-                finally:
-                    master.release()
-                await start
-                state = core.graph.system_state()
-                assert ["/held", ["/environment"]] in [entry for part in state for entry in part]
-                await interface.close()
+        async with (
+            serving(master) as uri,
+            Node("environment", argv=[], master_uri=uri, signals=False) as node,
+        ):
+            node._running.master.timeout = 0.1
+            interface = make(node, spec)
+            start = asyncio.create_task(interface.start())
+            try:
+                while master.held < 2 and not start.done():
+                    await asyncio.sleep(0.01)
+                node._running.master.timeout = 60.0
+            finally:
+                master.release()
+            await start
+            state = core.graph.system_state()
+            assert ["/held", ["/environment"]] in [entry for part in state for entry in part]
+            await interface.close()
 
 
 async def test_interface_that_the_core_refuses_does_not_start() -> None:
@@ -74,9 +76,11 @@ async def test_interface_that_the_core_refuses_does_not_start() -> None:
         master = HoldingMaster(core.uri, "/held")
         master.refuses = True
         master.release()
-        with serving(master) as uri:
-            async with Node("environment", argv=[], master_uri=uri, signals=False) as node:
-                interface = make(node, SPECS[0])
-                with pytest.raises(InterfaceError, match="refused"):
-                    await interface.start()
-                await interface.close()
+        async with (
+            serving(master) as uri,
+            Node("environment", argv=[], master_uri=uri, signals=False) as node,
+        ):
+            interface = make(node, SPECS[0])
+            with pytest.raises(InterfaceError, match="refused"):
+                await interface.start()
+            await interface.close()

@@ -71,23 +71,24 @@ class RefusingOnce:
 async def test_robot_that_is_not_joined_is_joined_later(topic: str) -> None:
     """It had no topic of its poses from then on: the planner took it for connected."""
     events: list[Event] = []
-    async with Core(port=0) as core, asyncio.timeout(120):
-        with serving(RefusingOnce(core.uri, f"/Robot2/{topic}")) as master_uri:
-            async with (
-                planner(master_uri, events) as (_, robots),
-                Node("robot", argv=[], master_uri=core.uri, signals=False) as robot,
-            ):
-                names = ["Robot1", "Robot2", "Robot3"]
-                with pytest.raises(MasterRefusedError, match="refused"):
-                    await robots.join(names)
-                assert [name for name in names if name in robots] == ["Robot1", "Robot3"]
-                await core.wait_until(lambda graph: not graph.publishers("/Robot2/goalNodesList"))
-                await robots.join(["Robot2"])
-                assert "Robot2" in robots
-                poses = await robot.advertise("/Robot2/amcl_pose", POSE, latch=True)
-                await poses.wait_for_subscribers()
-                poses.publish()
-                while not events:
-                    await asyncio.sleep(0.01)
+    async with (
+        Core(port=0) as core,
+        asyncio.timeout(120),
+        serving(RefusingOnce(core.uri, f"/Robot2/{topic}")) as master_uri,
+        planner(master_uri, events) as (_, robots),
+        Node("robot", argv=[], master_uri=core.uri, signals=False) as robot,
+    ):
+        names = ["Robot1", "Robot2", "Robot3"]
+        with pytest.raises(MasterRefusedError, match="refused"):
+            await robots.join(names)
+        assert [name for name in names if name in robots] == ["Robot1", "Robot3"]
+        await core.wait_until(lambda graph: not graph.publishers("/Robot2/goalNodesList"))
+        await robots.join(["Robot2"])
+        assert "Robot2" in robots
+        poses = await robot.advertise("/Robot2/amcl_pose", POSE, latch=True)
+        await poses.wait_for_subscribers()
+        poses.publish()
+        while not events:
+            await asyncio.sleep(0.01)
     assert isinstance(events[0], PoseSeen)
     assert events[0].robot == "Robot2"

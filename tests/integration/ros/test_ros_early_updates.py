@@ -56,14 +56,16 @@ async def test_update_before_the_answer_is_not_lost(
     async with make_node("a") as a, make_node("b") as b, asyncio.timeout(60):
         publishers = [await node.advertise("/t", STRING) for node in (a, b)]
         master = EarlyMaster(core.uri, early, late, times=100)
-        with serving(master) as uri:
-            async with Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener:
-                await listener.subscribe("/t", STRING)
-                assert master.registrations <= most
-                for publisher in publishers:
-                    await publisher.wait_for_subscribers()
-                await listener.reregister()
-                assert [publisher.connections for publisher in publishers] == [1, 1]
+        async with (
+            serving(master) as uri,
+            Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener,
+        ):
+            await listener.subscribe("/t", STRING)
+            assert master.registrations <= most
+            for publisher in publishers:
+                await publisher.wait_for_subscribers()
+            await listener.reregister()
+            assert [publisher.connections for publisher in publishers] == [1, 1]
 
 
 async def test_update_of_before_the_registration_is_asked_about(core: Core, make_node: MakeNode) -> None:
@@ -71,11 +73,13 @@ async def test_update_of_before_the_registration_is_asked_about(core: Core, make
     async with make_node("a") as a, make_node("b") as b, asyncio.timeout(60):
         publishers = [await node.advertise("/t", STRING) for node in (a, b)]
         master = EarlyMaster(core.uri, early=1, late=2, times=1)
-        with serving(master) as uri:
-            async with Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener:
-                await listener.subscribe("/t", STRING)
-                for publisher in publishers:
-                    await publisher.wait_for_subscribers()
+        async with (
+            serving(master) as uri,
+            Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener,
+        ):
+            await listener.subscribe("/t", STRING)
+            for publisher in publishers:
+                await publisher.wait_for_subscribers()
 
 
 class RefusingMaster(EarlyMaster):
@@ -97,9 +101,11 @@ class RefusingMaster(EarlyMaster):
 async def test_refused_registration_leaves_no_connection(core: Core, make_node: MakeNode) -> None:
     async with make_node("a") as a, asyncio.timeout(60):
         publisher = await a.advertise("/t", STRING)
-        with serving(RefusingMaster(core.uri, publisher)) as uri:
-            async with Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener:
-                with pytest.raises(MasterRefusedError):
-                    await listener.subscribe("/t", STRING)
-                while publisher.connections:
-                    await asyncio.sleep(0.01)
+        async with (
+            serving(RefusingMaster(core.uri, publisher)) as uri,
+            Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener,
+        ):
+            with pytest.raises(MasterRefusedError):
+                await listener.subscribe("/t", STRING)
+            while publisher.connections:
+                await asyncio.sleep(0.01)

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partialmethod
 from typing import Any
+from xmlrpc.client import ServerProxy
 
 import pytest
 from support.ros_masters import HoldingMaster, serving
@@ -30,7 +31,7 @@ KINDS: dict[str, Register] = {
 @pytest.fixture
 async def master(core: Core) -> AsyncIterator[HoldingMaster]:
     master = HoldingMaster(core.uri, "/t")
-    with serving(master) as uri:
+    async with serving(master) as uri:
         master.uri = uri
         yield master
         master.release()
@@ -174,11 +175,26 @@ async def test_master_that_is_busy_for_long_is_given_up(
         master.release()
 
 
+async def test_call_on_its_way_is_answered_while_a_master_ends(core: Core) -> None:
+    """By a core in the same event loop: one that waited there for the call's end would wait in vain."""
+    master = HoldingMaster(core.uri, "/t")
+    async with asyncio.timeout(60):
+        async with serving(master) as uri:
+            with ServerProxy(uri) as caller:
+                arguments = ("/a", "/t", STRING, "http://127.0.0.1:1/")
+                call = asyncio.create_task(asyncio.to_thread(caller.registerPublisher, *arguments))
+                while not master.held:
+                    await asyncio.sleep(0.01)
+            master.release()
+        await call
+    assert master.calls == ["registerPublisher"]
+
+
 @pytest.mark.usefixtures("impatient")
 async def test_node_that_starts_waits_for_a_busy_master(core: Core) -> None:
     """Longer than for one that is not up, which its user would wait for in vain."""
     master = HoldingMaster(core.uri, "/use_sim_time", method="getParam")
-    with serving(master) as master.uri:
+    async with serving(master) as master.uri:
         node = Node(
             "a", argv=[], master_uri=master.uri, master_timeout=0.2, intra_process=False, signals=False
         )

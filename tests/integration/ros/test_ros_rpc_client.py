@@ -156,10 +156,9 @@ async def test_other_servers_get_one_call_in_a_request() -> None:
             self.methods.add(method)
             return 1, "", arguments[0]
 
-    with serving(Foreign()) as uri:
-        async with RpcClient() as rpc:
-            answers = await asyncio.gather(*(rpc.call(uri, "get", (f"/{number}",)) for number in range(100)))
-            assert rpc.connections <= client.MAX_CONNECTIONS
+    async with serving(Foreign()) as uri, RpcClient() as rpc:
+        answers = await asyncio.gather(*(rpc.call(uri, "get", (f"/{number}",)) for number in range(100)))
+        assert rpc.connections <= client.MAX_CONNECTIONS
     assert [answer[2] for answer in answers] == [f"/{number}" for number in range(100)]
     assert Foreign.methods == {"get"}
 
@@ -175,14 +174,17 @@ async def test_calls_in_order_are_made_in_order_everywhere() -> None:
 
     seen: list[str] = []
     dispatcher = Counted()
-    with serving(Foreign()) as foreign:
-        async with RpcClient() as rpc, RpcServer(dispatcher, "127.0.0.1") as one:
-            uri = f"http://127.0.0.1:{one.port}/"
-            assert not rpc.takes_batches(uri)
-            assert await rpc.send_in_order(foreign, "get", documents) == expected
-            assert await rpc.send_in_order(uri, "get", documents) == expected
-            assert rpc.takes_batches(uri)
-            assert not rpc.takes_batches(foreign)
+    async with (
+        serving(Foreign()) as foreign,
+        RpcClient() as rpc,
+        RpcServer(dispatcher, "127.0.0.1") as one,
+    ):
+        uri = f"http://127.0.0.1:{one.port}/"
+        assert not rpc.takes_batches(uri)
+        assert await rpc.send_in_order(foreign, "get", documents) == expected
+        assert await rpc.send_in_order(uri, "get", documents) == expected
+        assert rpc.takes_batches(uri)
+        assert not rpc.takes_batches(foreign)
     assert seen == [f"/{number}" for number in range(20)]
     assert dispatcher.requests == 2
 
