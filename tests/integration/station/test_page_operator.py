@@ -78,8 +78,8 @@ class Site:
     modes: list[str]
     problems: list[str] = field(default_factory=list)
 
-    async def open(self, width: int = 1280) -> Page:
-        page = await self.browser.new_page(viewport={"width": width, "height": 900})
+    async def open(self, width: int = 1280, *, has_touch: bool = False) -> Page:
+        page = await self.browser.new_page(viewport={"width": width, "height": 900}, has_touch=has_touch)
         await page.add_init_script(FEW_FRAMES)
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.set_default_timeout(WAIT_MS)

@@ -65,6 +65,57 @@ async def test_a_press_on_the_card_hits_its_button() -> None:
         await page.locator("#robot-card button", has_text="Localize").wait_for(state="detached")
 
 
+async def test_a_press_hits_what_moves_away() -> None:
+    """Another operator's stop is listed above the card before the release."""
+    async with site() as made:
+        page = await made.open()
+        await page.locator("tr[data-robot=Robot1]").click()
+        stop = page.locator("#robot-card button.stop")
+        await stop.hover()
+        before = await stop.bounding_box()
+        await page.mouse.down()
+        made.feed.on_control({"Robot2": "an operator"}, {})
+        await page.locator("#attention-list button", has_text="Release").wait_for()
+        after = await stop.bounding_box()
+        assert before is not None
+        assert after is not None
+        assert after["y"] > before["y"] + before["height"]
+        async with page.expect_request("**/robots/Robot1/emergency-stop"):
+            await page.mouse.up()
+
+
+async def test_a_finger_hits_what_it_pressed() -> None:
+    """Another button is at its place before the release: another operator has paused the fleet."""
+    async with site() as made:
+        page = await made.open(has_touch=True)
+        box = await page.locator("#fleet-pause").bounding_box()
+        assert box is not None
+        middle = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        fingers = await page.context.new_cdp_session(page)
+        await fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [middle]})
+        made.feed.on_change(made.view.on_changes({**changes(), "mode": "paused"}))
+        await page.locator("#fleet-resume").wait_for()
+        async with page.expect_request("**/mode") as request:
+            await fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        assert (await request.value).post_data_json["mode"] == "paused"
+
+
+async def test_a_press_is_taken_back_by_a_release_elsewhere() -> None:
+    async with site() as made:
+        page = await made.open()
+        sent: list[str] = []
+        page.on("request", lambda request: sent.append(request.url))
+        await page.locator("#fleet-pause").hover()
+        await page.mouse.down()
+        await page.locator("#fleet-buttons").locator("xpath=..").hover(position={"x": 5, "y": 5}, force=True)
+        await page.mouse.up()
+        await page.locator("tr[data-robot=Robot1]").click()
+        await page.locator("#robot-card").wait_for()
+        assert [url for url in sent if url.endswith("/mode")] == []
+        await page.locator("#fleet-pause").click()
+        await page.locator("#fleet-resume").wait_for()
+
+
 async def test_a_press_on_a_row_selects_its_robot() -> None:
     """The table is sorted anew before the release: robots in trouble come first."""
     async with site() as made:
