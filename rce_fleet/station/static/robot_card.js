@@ -39,7 +39,7 @@ export class RobotCard {
         button.addEventListener("click", () => this.answer(name, robot.id));
         row.append(button);
       }
-      this.box.replaceChildren(this.title, this.text, row);
+      this.box.replaceChildren(this.title, row, this.text); // the text's length does not move the buttons
     }
     const age = heartbeatAge(robot);
     const parts = [robot.undelivered && t("condition.undelivered", { user: robot.emergency }), robot.activity ?? robot.state, robot.pose_only && t("robot.poseOnly"), robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];

@@ -66,7 +66,7 @@ async def test_a_press_on_the_card_hits_its_button() -> None:
 
 
 async def test_a_press_hits_what_moves_away() -> None:
-    """Another operator's stop is listed above the card before the release."""
+    """Another robot is in the table above the card before the release."""
     async with site() as made:
         page = await made.open()
         await page.locator("tr[data-robot=Robot1]").click()
@@ -74,14 +74,32 @@ async def test_a_press_hits_what_moves_away() -> None:
         await stop.hover()
         before = await stop.bounding_box()
         await page.mouse.down()
-        made.feed.on_control({"Robot2": "an operator"}, {})
-        await page.locator("#attention-list button", has_text="Release").wait_for()
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot3"))))
+        await page.locator("tr[data-robot=Robot3]").wait_for()
         after = await stop.bounding_box()
         assert before is not None
         assert after is not None
         assert after["y"] > before["y"] + before["height"]
         async with page.expect_request("**/robots/Robot1/emergency-stop"):
             await page.mouse.up()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+async def test_stops_keep_their_places(width: int) -> None:
+    """Whatever needs attention, whatever can be released, and whatever is said of the robot."""
+    async with site() as made:
+        page = await made.open(width)
+        await page.locator("tr[data-robot=Robot1]").click()
+        stops = [page.locator(selector) for selector in ("#robot-card button.stop", "#stop-all")]
+        before = [await stop.bounding_box() for stop in stops]
+        assert not await page.locator("#release-all").is_visible()
+        trouble = [robot(name, state="stuck", reason="why " * 50) for name in ("Robot1", "Robot2")]
+        made.feed.on_change(made.view.on_changes(changes(*trouble)))
+        made.feed.on_control({"Robot2": "an operator"}, {})
+        await page.locator("#attention-list button", has_text="Release").wait_for()
+        await page.locator("#robot-card p", has_text="why why").wait_for()
+        await page.locator("#release-all").wait_for()
+        assert [await stop.bounding_box() for stop in stops] == before
 
 
 async def test_a_finger_hits_what_it_pressed() -> None:
