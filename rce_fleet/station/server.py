@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from aiohttp import hdrs, web
 from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
-from rce.web.openapi import PREFIX, build_document
+from rce.web.openapi import PREFIX, Operation, build_document
 from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
 from rce_fleet.api.fleet import CellBlockModel
@@ -156,16 +156,11 @@ class Station:
         self.fleet_api.add_to(app)
         routes = (route for table, _ in tables for route in table)
         operations = [*(route.operation for route in routes), *self.fleet_api.operations]
-        document = build_document(
-            [replace(each, errors=tuple({*each.errors, 422, 429})) for each in operations],
-            title="RCE operator station",
-            description="Control a fleet of robots: tasks, goals, zones, events. For the page and an ERP.",
-            error=Problem,
-        )
+        document = cache(partial(_document_of, operations))
 
         async def describe(request: web.Request) -> web.StreamResponse:
             del request
-            return web.json_response(document)
+            return web.Response(text=document(), content_type="application/json")
 
         app.router.add_get(f"{PREFIX}/openapi.json", describe)
         app.router.add_get(f"{PREFIX}/live", self._socket.handle)
@@ -404,3 +399,13 @@ async def _set_headers(request: web.Request, response: web.StreamResponse) -> No
 
 def _reply(model: BaseModel) -> web.Response:
     return web.Response(text=model.model_dump_json(), content_type="application/json")
+
+
+def _document_of(operations: list[Operation]) -> str:
+    document = build_document(
+        [replace(each, errors=tuple({*each.errors, 422, 429})) for each in operations],
+        title="RCE operator station",
+        description="Control a fleet of robots: tasks, goals, zones, events. For the page and an ERP.",
+        error=Problem,
+    )
+    return json.dumps(document)
