@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from support.browser import BROWSER, CHROMIUM, FEW_FRAMES
+from support.browser import BROWSER, CHROMIUM, FEW_FRAMES, press
 from support.fleet_station import fleet_station
 from support.managed_fleet import ManagedFleet, managed_fleet
 
@@ -109,12 +109,9 @@ async def check_lost_answer(page: Page, fleet: ManagedFleet) -> None:
     await fleet.until_state(made["id"], "cancelled")
 
 
-async def press(page: Page, selector: str) -> None:
+async def click_while_tasks_change(page: Page, selector: str) -> None:
     """Click; the list is drawn again between press and release, as when all tasks change then."""
-    button = page.locator(selector)
-    await button.scroll_into_view_if_needed()
-    await button.hover()
-    await page.mouse.down()
+    await press(page.locator(selector))
     await page.evaluate(
         """() => {
             for (const task of rceFleet.work.tasks.values()) task.state = "cancelling";
@@ -130,7 +127,7 @@ async def check_buttons(page: Page, fleet: ManagedFleet) -> None:
     task = created.body["id"]
     await page.locator(f"#task-{task}-hold").click()
     await fleet.until_state(task, "held")
-    await press(page, f"#task-{task}-resume")
+    await click_while_tasks_change(page, f"#task-{task}-resume")
     running = await fleet.until_state(task, "running")
     robot = running["robot_assigned"]
     await fleet.ask("POST", f"/robots/{robot}/pause")

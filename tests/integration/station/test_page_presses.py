@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from integration.station.test_page_operator import site
+from support.browser import press
 from support.planner_states import changes, robot
 
 pytestmark = pytest.mark.needs("chromium")
@@ -27,9 +28,7 @@ async def test_a_row_that_changes_leaves_other_rows_their_clicks() -> None:
         tell("Robot1", "unreachable")
         cancel = page.locator("#attention-list button[aria-label$=': Robot1']", has_text="Cancel")
         other = page.locator("#attention-list li", has_text="Robot2")
-        await cancel.scroll_into_view_if_needed()
-        await cancel.hover()
-        await page.mouse.down()
+        await press(cancel)
         tell("Robot2", "silent")
         tell("Robot1", "stuck")
         await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').state === 'stuck'")
@@ -56,8 +55,7 @@ async def test_a_press_on_the_card_hits_its_button() -> None:
     async with site() as made:
         page = await made.open()
         await page.locator("tr[data-robot=Robot1]").click()
-        await page.locator("#robot-card button.stop").hover()
-        await page.mouse.down()
+        await press(page.locator("#robot-card button.stop"))
         await page.evaluate("rceFleet.fleet.things.Robot1 = ['light']")
         await page.evaluate("void rceFleet.fleet.dispatchEvent(new Event('selected'))")  # the card is drawn
         async with page.expect_request("**/robots/Robot1/emergency-stop"):
@@ -71,9 +69,8 @@ async def test_a_press_hits_what_moves_away() -> None:
         page = await made.open()
         await page.locator("tr[data-robot=Robot1]").click()
         stop = page.locator("#robot-card button.stop")
-        await stop.hover()
+        await press(stop)
         before = await stop.bounding_box()
-        await page.mouse.down()
         made.feed.on_change(made.view.on_changes(changes(robot("Robot3"))))
         await page.locator("tr[data-robot=Robot3]").wait_for()
         after = await stop.bounding_box()
@@ -89,6 +86,7 @@ async def test_stops_keep_their_places(width: int) -> None:
     """Whatever needs attention, whatever can be released, and whatever is said of the robot."""
     async with site() as made:
         page = await made.open(width)
+        await page.wait_for_load_state("networkidle")
         await page.locator("tr[data-robot=Robot1]").click()
         stops = [page.locator(selector) for selector in ("#robot-card button.stop", "#stop-all")]
         before = [await stop.bounding_box() for stop in stops]
@@ -106,6 +104,7 @@ async def test_a_finger_hits_what_it_pressed() -> None:
     """Another button is at its place before the release: another operator has paused the fleet."""
     async with site() as made:
         page = await made.open(has_touch=True)
+        await page.wait_for_load_state("networkidle")
         box = await page.locator("#fleet-pause").bounding_box()
         assert box is not None
         middle = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
@@ -123,8 +122,7 @@ async def test_a_press_is_taken_back_by_a_release_elsewhere() -> None:
         page = await made.open()
         sent: list[str] = []
         page.on("request", lambda request: sent.append(request.url))
-        await page.locator("#fleet-pause").hover()
-        await page.mouse.down()
+        await press(page.locator("#fleet-pause"))
         await page.locator("#fleet-buttons").locator("xpath=..").hover(position={"x": 5, "y": 5}, force=True)
         await page.mouse.up()
         await page.locator("tr[data-robot=Robot1]").click()
@@ -138,8 +136,7 @@ async def test_a_press_on_a_row_selects_its_robot() -> None:
     """The table is sorted anew before the release: robots in trouble come first."""
     async with site() as made:
         page = await made.open()
-        await page.locator("tr[data-robot=Robot2]").hover()
-        await page.mouse.down()
+        await press(page.locator("tr[data-robot=Robot2]"))
         made.feed.on_change(made.view.on_changes(changes(robot("Robot2", state="silent"))))
         await page.wait_for_function("rceFleet.fleet.robots.get('Robot2').state === 'silent'")
         await page.evaluate(SEARCH)
