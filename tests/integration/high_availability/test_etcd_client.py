@@ -223,7 +223,7 @@ async def test_a_call_that_left_a_member_may_be_done() -> None:
 async def test_a_late_answer_counts_while_the_next_member_is_asked() -> None:
     """Where each member needs longer than one may take, etcd can still be used."""
     asked = 0
-    both = asyncio.Event()
+    both, ended = asyncio.Event(), asyncio.Event()
 
     async def far_away(_: web.Request) -> web.Response:
         nonlocal asked
@@ -233,7 +233,7 @@ async def test_a_late_answer_counts_while_the_next_member_is_asked() -> None:
             await both.wait()
             return web.json_response({**HEADER, "count": "1"})
         both.set()
-        await asyncio.sleep(NEVER_S)
+        await ended.wait()
         return web.json_response(HEADER)
 
     async with contextlib.AsyncExitStack() as stack:
@@ -242,6 +242,7 @@ async def test_a_late_answer_counts_while_the_next_member_is_asked() -> None:
             page = await client.range("/", timeout=0.1)
             assert page.count == 1
             assert client.in_use == endpoints[1]
+        ended.set()
 
 
 async def test_a_call_whose_answer_has_begun_stays() -> None:
