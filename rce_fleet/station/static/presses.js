@@ -30,7 +30,7 @@ export class Presses {
   }
 
   #click(event) {
-    if (!event.isTrusted || !this.#isReleased) return;
+    if (!event.isTrusted || event.detail === 0 || !this.#isReleased) return; // detail 0: by a key
     this.#isReleased = false;
     const { control } = this.#pressed;
     if (control.contains(event.target)) return;

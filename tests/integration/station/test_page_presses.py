@@ -1,4 +1,4 @@
-"""What is pressed on the page stays as it is until its release."""
+"""Presses on the page hit what was meant, whatever changes until their release."""
 
 from __future__ import annotations
 
@@ -130,6 +130,24 @@ async def test_a_press_is_taken_back_by_a_release_elsewhere() -> None:
         assert [url for url in sent if url.endswith("/mode")] == []
         await page.locator("#fleet-pause").click()
         await page.locator("#fleet-resume").wait_for()
+
+
+async def test_a_key_is_not_taken_for_a_lost_click() -> None:
+    """No click comes, as what was pressed was removed before the release; then a key presses another button."""
+    async with site() as made:
+        page = await made.open()
+        sent: list[str] = []
+        page.on("request", lambda request: sent.append(request.url))
+        await page.locator("tr[data-robot=Robot1]").click()
+        stop = page.locator("#robot-card button.stop")
+        await press(stop)
+        await stop.evaluate("stop => stop.remove()")
+        await page.mouse.up()
+        await page.locator("#fleet-pause").focus()
+        await page.keyboard.press("Enter")
+        await page.locator("#fleet-resume").wait_for()
+        assert made.modes == ["paused"]
+        assert [url for url in sent if url.endswith("/emergency-stop")] == []
 
 
 async def test_a_press_on_a_row_selects_its_robot() -> None:
