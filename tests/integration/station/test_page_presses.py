@@ -133,7 +133,7 @@ async def test_a_press_is_taken_back_by_a_release_elsewhere() -> None:
 
 
 async def test_a_key_is_not_taken_for_a_lost_click() -> None:
-    """No click comes, as what was pressed was removed before the release; then a key presses another button."""
+    """No click comes, as what was pressed was removed before its release; then a key presses another one."""
     async with site() as made:
         page = await made.open()
         sent: list[str] = []
