@@ -60,3 +60,14 @@ async def say_until_echoed(say: Publisher, echo: Subscriber, timeout: float = 60
         say.publish(data="begin")
         while (await anext(aiter(echo))).data != "begin":
             pass
+
+
+async def collect(subscriber: Subscriber, count: int) -> list[str]:
+    """Return the data of the next messages."""
+    found = []
+    async with asyncio.timeout(60):
+        async for message in subscriber:
+            found.append(message.data)
+            if len(found) == count:
+                break
+    return found
