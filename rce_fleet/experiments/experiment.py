@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SETTLE_S = 0.5
 """From the beginning of a condition to its measurement, seconds."""
-START_S = 6.5
+START_S = 5.0
 """About how long a system takes to start and to end, seconds."""
 PAPER_SYSTEMS = ("single_master", "multi_master", "cloud")
 NETBOOK_CORES = 0.2
@@ -146,11 +146,6 @@ class Experiment(ABC):
     @abstractmethod
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run of a set-up takes."""
-
-    def most_runs(self, setup: Condition) -> int | None:
-        """Return how many runs of a set-up count at most; None: as many as are asked for."""
-        del setup
-        return None
 
     def warm_up_seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long the run takes that does not count."""

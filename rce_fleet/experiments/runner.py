@@ -111,8 +111,6 @@ class Plan:
     def works(self, experiment: Experiment, rows: list[Row]) -> list[Work]:
         """Return the runs of an experiment that are still to be done."""
         planned = schedule(self._setups(experiment), self.runs, self.seed, warm_up=not self.options.quick)
-        most = {condition: experiment.most_runs(condition) for condition in dict(planned)}
-        planned = [run for run in planned if run.number <= (most[run.condition] or run.number)]
         done = {Run(row.condition, row.run) for row in rows if row.metric == DONE}
         return [Work(experiment, run) for run in remaining(planned, done)]
 

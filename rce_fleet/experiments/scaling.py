@@ -2,8 +2,6 @@
 
 Robots send scans as in the experiment ``laser``, which are not printed: a console is full long before a
 system is. The simulated robots are spread over several programs, so that these are not what breaks first.
-
-Runs of many robots take a minute, so there is one of each number above ten.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.round_trip import ask, echo_on, values_of
 from rce_fleet.experiments.streaming import Part, Streaming
-from rce_fleet.experiments.systems.base import Flow, Layout, Workload
+from rce_fleet.experiments.systems.base import Flow, Layout, Workload, of_each
 from rce_fleet.experiments.workloads.control import QUIET
 from rce_fleet.experiments.workloads.echo import KIND
 from rce_fleet.experiments.workloads.robots import SCAN
@@ -27,20 +25,20 @@ from rce_fleet.experiments.workloads.telling import READY, reports
 if TYPE_CHECKING:
     from rce_fleet.experiments.systems.base import RunningWorkload, System
 
-ROBOTS = (1, 10, 20, 35, 50)
-"""The experiment ``laser`` has five."""
+ROBOTS = (1, 10, 50)
+"""The experiment ``laser`` has five. A run of fifty takes a minute: more numbers would leave fewer runs."""
 QUICK_ROBOTS = (2,)
 ONE, EACH = "one", "each"
 """One container for all robots, or one for each."""
-FEW_ROBOTS = 10
-RUNS_OF_MANY = 1
 WARMED_UP = ROBOTS[0]
 """Robots of the only set-up that is warmed up: the others run the same programs."""
 ROBOTS_PER_PROGRAM = 5
 TRIPS = {7: 10}
 """Round trips, by the bytes of their messages."""
-ROBOT_S = {ONE: 0.5, EACH: 1.0}
-"""About how long a robot takes to start, seconds."""
+ROBOT_S = {ONE: 0.4, EACH: 0.8}
+"""About how long a robot takes to start in a cloud, by the containers, seconds."""
+NODE_S = 0.05
+"""About how long it takes elsewhere, seconds."""
 
 
 class Scaling(Experiment):
@@ -61,16 +59,13 @@ class Scaling(Experiment):
 
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
-        per_robot = ROBOT_S[dict(setup.factors)["containers"]]
+        in_cloud = setup.system == "cloud"
+        per_robot = ROBOT_S[dict(setup.factors)["containers"]] if in_cloud else NODE_S
         return START_S + SETTLE_S + options.seconds + robots_of(setup) * per_robot
 
     def warm_up_seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long the run takes that does not count."""
         return self.seconds(setup, options) if robots_of(setup) == WARMED_UP else 0.0
-
-    def most_runs(self, setup: Condition) -> int | None:
-        """Return how many runs of a set-up count at most; None: as many as are asked for."""
-        return None if robots_of(setup) <= FEW_ROBOTS else RUNS_OF_MANY
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""
@@ -139,5 +134,6 @@ def shares(robots: list[int]) -> list[list[int]]:
 
 async def ready_at(listeners: list[RunningWorkload]) -> float:
     """Return when all listeners had heard of all their robots, seconds since 1970."""
-    found = [report for listener in listeners for report in reports(await listener.lines())]
+    lines = await of_each(listeners, lambda listener: listener.lines())
+    found = [report for own in lines for report in reports(own)]
     return max(float(report[READY]) for report in found if READY in report)

@@ -7,6 +7,7 @@ from math import nan, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,12 +50,13 @@ class Estimate(NamedTuple):
 
 
 def estimate(values: Sequence[float], *, seed: int = 0) -> Estimate:
-    """Return the median of runs with its 95 % confidence interval, by the percentile bootstrap.
+    """Return the median of runs with its 95 % confidence interval, by the expanded percentile bootstrap.
 
-    With few runs it is too narrow: with ten a little, and with three it is the range of the values, which has
-    the true median in 75 of 100 experiments.
+    With ten runs it has the true median in some 96 of 100 experiments. With five and fewer it is the range of
+    the values, and too narrow: with three, the true median is in it in 75 of 100 experiments.
 
-    Source: B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
+    Source: B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13, with the
+    percentiles of :func:`tail_share`.
 
     Args:
         values: One value for each run; at least one.
@@ -69,9 +71,26 @@ def estimate(values: Sequence[float], *, seed: int = 0) -> Estimate:
         return Estimate(median, nan, nan, len(sample))
     random = np.random.default_rng(seed)
     drawn = sample[random.integers(0, len(sample), (RESAMPLES, len(sample)))]
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(np.median(drawn, axis=1), [tail, 100 - tail])
+    tail = tail_share(len(sample))
+    low, high = np.quantile(np.median(drawn, axis=1), [tail, 1 - tail])
     return Estimate(median, float(low), float(high), len(sample))
+
+
+def tail_share(runs: int) -> float:
+    """Return the share of resampled medians that lies outside of an interval on each side.
+
+    It is less than half of 5 %, because samples that are drawn from a sample vary too little: by the square
+    root of (n - 1) / n, and as the normal distribution, where Student's tells how far a mean of n values lies
+    off. With half of 5 %, an interval of ten runs has the true median in 94 of 100 experiments.
+
+    Source: T. C. Hesterberg, "What Teachers Should Know About the Bootstrap: Resampling in the Undergraduate
+    Statistics Curriculum", The American Statistician 69 (4), 2015: the expanded percentile interval.
+
+    Args:
+        runs: At least two.
+    """
+    student = stdtrit(runs - 1, (1 + CONFIDENCE) / 2)
+    return float(ndtr(-sqrt(runs / (runs - 1)) * student))
 
 
 class RepeatShares(NamedTuple):
@@ -95,13 +114,13 @@ def repeat_shares(runs: int, other_runs: int) -> RepeatShares:
         other_runs: Number of runs that the other median is of; at least one.
     """
     random = np.random.default_rng(0)
-    tail = 50 * (1 - CONFIDENCE)
+    tail = tail_share(runs)
     wider = sqrt(1 + runs / other_runs)
     inside = np.zeros(2, np.int64)
     for _ in range(_BLOCKS):
         samples = random.standard_normal((_SIMULATED, runs))
         drawn = random.integers(0, runs, (_SIMULATED_RESAMPLES, runs))
-        ends = np.percentile(np.median(samples[:, drawn], axis=2), [tail, 100 - tail], axis=1)
+        ends = np.quantile(np.median(samples[:, drawn], axis=2), [tail, 1 - tail], axis=1)
         others = np.median(random.standard_normal((_SIMULATED, other_runs)), axis=1)
         medians = np.median(samples, axis=1)
         for place, (low, high) in enumerate((ends, medians + wider * (ends - medians))):

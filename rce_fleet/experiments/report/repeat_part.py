@@ -6,6 +6,7 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import (
+    DIGITS,
     factors_label,
     interval,
     scale_for,
@@ -26,8 +27,8 @@ CHANCE = "by chance"
 def comparison_text(comparison: Comparison) -> str:
     """Return how many medians of the second run lie in the first one's intervals, and which do not."""
     if not (comparison.pairs or comparison.constant):
-        return "Nothing can be compared: no metric has an interval in the first run and a second value."
-    parts = [*filter(None, (_verdict(comparison), _constant(comparison))), _shares(comparison)]
+        return "Nothing can be compared: no metric has an interval in both runs."
+    parts = [_verdict(comparison), *filter(None, [_varying(comparison)]), _shares(comparison)]
     if comparison.outside:
         head = (
             "experiment",
@@ -44,7 +45,7 @@ def comparison_text(comparison: Comparison) -> str:
         rows = [_row(pair) for pair in comparison.outside]
         parts.append(folded("Medians outside of the intervals", markdown(head, rows)))
     counts = {
-        "have no interval in the first run": comparison.without_interval,
+        "have no interval in one of the runs": comparison.without_interval,
         "were measured in the first run only": len(comparison.only_first),
         "were measured in the second run only": len(comparison.only_second),
     }
@@ -53,29 +54,35 @@ def comparison_text(comparison: Comparison) -> str:
 
 
 def _verdict(comparison: Comparison) -> str:
+    reached = "reached" if comparison.reaches_goal else "not reached"
+    text = (
+        f"Of all {len(comparison.pairs) + len(comparison.constant)} medians of the second run, "
+        f"{_percent(comparison.inside_of_all)} lie in the intervals of the first one; the goal of "
+        f"{_percent(GOAL)} is {reached}. Numbers are compared as this page shows them, with {DIGITS} digits; "
+        "values over time are not counted."
+    )
+    if not comparison.constant:
+        return text
+    return (
+        f"{text} {len(comparison.constant)} of them are of metrics that had one value only in each run, such "
+        f"as losses of 0: {comparison.same} of these have the same value in both."
+    )
+
+
+def _varying(comparison: Comparison) -> str:
     if not comparison.pairs:
         return ""
     by_chance = comparison.by_chance
-    reached = "reached" if comparison.reaches_goal else "not reached"
     return (
-        f"Of {len(comparison.pairs)} medians of the second run, {_percent(comparison.inside)} lie in the "
-        f"intervals of the first one; the goal of {_percent(GOAL)} is {reached}. If nothing differed but "
+        f"Of the {len(comparison.pairs)} medians of what varies, {_percent(comparison.inside)} lie in the "
+        f"intervals, and with all digits {_percent(comparison.exactly_inside)}. If nothing differed but "
         f"chance, some {_percent(by_chance.estimate)} would, since the second medians vary too: "
         f"{_percent(repeat_shares(10, 10).estimate)} of those of ten runs, "
         f"{_percent(repeat_shares(3, 3).estimate)} of those of three. In intervals that allow for that, "
         "which are wider (with as many runs in both by the square root of 2), lie "
         f"{_percent(comparison.expected)}; by chance alone it would be some {_percent(by_chance.repeat)}. "
         f"In the first one's intervals, or outside by {_percent(NEAR)} of the first median at most, lie "
-        f"{_percent(comparison.inside_or_near)}. Values over time are not counted."
-    )
-
-
-def _constant(comparison: Comparison) -> str:
-    if not comparison.constant:
-        return ""
-    return (
-        f"Not counted are {len(comparison.constant)} metrics that had one value only in each run, such as "
-        f"losses of 0: {comparison.same} of them have the same value in both."
+        f"{_percent(comparison.inside_or_near)}."
     )
 
 
@@ -83,16 +90,17 @@ def _shares(comparison: Comparison) -> str:
     rows = [
         (
             *(name, str(len(part.pairs))),
-            *map(_percent, (part.inside, part.by_chance.estimate, part.expected, part.by_chance.repeat)),
+            *map(_percent, (part.inside, part.exactly_inside, part.by_chance.estimate)),
+            *map(_percent, (part.expected, part.by_chance.repeat)),
             _percent(part.inside_or_near),
             f"{part.same} of {len(part.constant)}" if part.constant else MISSING,
         )
         for name, part in comparison.experiments()
     ]
     head = (
-        *("experiment", "medians", "in the intervals", "by chance alone", "in the wider ones"),
-        *("by chance alone", f"in the intervals, or outside by {_percent(NEAR)} at most"),
-        "constant, and the same",
+        *("experiment", "medians that vary", "in the intervals", "with all digits", "by chance alone"),
+        *("in the wider ones", "by chance alone"),
+        *(f"in the intervals, or outside by {_percent(NEAR)} at most", "constant, and the same"),
     )
     return markdown(head, rows)
 

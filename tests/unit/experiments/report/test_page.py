@@ -243,7 +243,7 @@ def test_second_run_is_compared(rows: list[Row]) -> None:
     same = [row for row in rows if row.metric != "rain"]
     again = summarize(Measurements.of([*same, *changed]))
     text = page_text(Measurements.of(rows), {}, {}, "images", OtherRun(again, {}))
-    assert "| weather | 1 | 0 % | 83 % | 0 % |" in text
+    assert "| weather | 1 | 0 % | 0 % | 83 % | 0 % |" in text
     both = "3.00 [2.70, 3.30] | 6.00 [5.40, 6.60]"
     assert f"| weather | CRS | RCE | sky=blue | `rain` | {both} | mm | +100.0 % | unlikely |" in text
     assert "the goal of 90 % is reached" in text

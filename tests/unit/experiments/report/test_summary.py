@@ -97,24 +97,26 @@ def test_a_summary_that_was_cut_is_read_up_to_its_last_whole_line(tmp_path: Path
 
 
 def test_medians_of_a_second_run_are_counted() -> None:
-    """Of four: one in the interval, one outside by 2 %, one by 100 %, and one of which nothing is known."""
+    """Of five: one in the interval, one outside by 2 %, one by 100 %, and two with too few runs."""
     first = Measurements.of(
         [
             *rows(SMS, "rate", [7.0, 7.5, 8.0]),
             *rows(SMS, "received", [100.0, 100.0, 100.0]),
             *rows(SMS, "lost", [1.0, 1.0, 1.0]),
             *rows(SMS, "server.network@0.5", [1.0, 1.0, 1.0]),
+            *rows(SMS, "delay_p95", [0.1, 0.1, 0.1]),
             *rows(MMS, "rate", [4.0]),
             *rows(MMS, "lost", [0.0]),
         ]
     )
     second = Measurements.of(
         [
-            *rows(SMS, "rate", [7.4]),
-            *rows(SMS, "received", [102.0]),
-            *rows(SMS, "lost", [2.0]),
-            *rows(SMS, "server.network@0.5", [9.0]),
-            *rows(MMS, "rate", [4.0]),
+            *rows(SMS, "rate", [7.3, 7.4, 7.5]),
+            *rows(SMS, "received", [102.0, 102.0, 103.0]),
+            *rows(SMS, "lost", [0.0, 2.0, 2.0]),
+            *rows(SMS, "server.network@0.5", [9.0, 9.0, 9.0]),
+            *rows(SMS, "delay_p95", [0.1, 0.1]),
+            *rows(MMS, "rate", [4.0, 4.1, 4.2]),
             *rows(MMS, "delay_p50", [0.1]),
         ]
     )
@@ -127,7 +129,7 @@ def test_medians_of_a_second_run_are_counted() -> None:
         ("lost", 1.0),
         ("received", pytest.approx(0.02)),
     ]
-    assert found.without_interval == 1
+    assert found.without_interval == 2
     assert [one.metric for one in found.only_first] == ["lost"]
     assert [one.metric for one in found.only_second] == ["delay_p50"]
     assert [name for name, _ in found.experiments()] == ["laser"]
@@ -169,10 +171,26 @@ def test_constant_metrics_are_counted_apart() -> None:
     assert [pair.first.metric for pair in found.outside] == ["topics", "rate"]
     assert found.by_chance.estimate == pytest.approx(0.6, abs=0.03)  # 3 of 5 orders of six values
     text = comparison_text(found)
-    assert "2 metrics that had one value only in each run, such as losses of 0: 1 of them" in text
+    assert found.inside_of_all == pytest.approx(1 / 3)
+    assert "Of all 3 medians of the second run, 33 % lie in the intervals" in text
+    assert "2 of them are of metrics that had one value only in each run, such as losses of 0: 1 of" in text
     constant = compare(first[:1], first[:1])
-    assert (constant.pairs, constant.same) == ((), 1)
-    assert "| laser | 0 | - | - | - | - | - | 1 of 1 |" in comparison_text(constant)
+    assert (constant.pairs, constant.same, constant.reaches_goal) == ((), 1, True)
+    assert "| laser | 0 | - | - | - | - | - | - | 1 of 1 |" in comparison_text(constant)
+
+
+@pytest.mark.parametrize(
+    ("again", "is_inside"), [(250_449_000.0, True), (250_501_000.0, False), (249_499_000.0, False)]
+)
+def test_digits_that_the_page_does_not_show_do_not_count(again: float, *, is_inside: bool) -> None:
+    """An interval from 250.1 to 250.4 MB is shown as [250, 250]."""
+    first, second = (
+        summarize(Measurements.of(rows(SMS, "client.memory", values, unit="B")))
+        for values in ([250_100_000.0, 250_200_000.0, 250_400_000.0], [1.0, again, 1e9])
+    )
+    found = compare(first, second)
+    assert (found.inside, found.exactly_inside) == (float(is_inside), 0.0)
+    assert len(found.outside) == (not is_inside)
 
 
 @pytest.mark.parametrize(
