@@ -16,7 +16,7 @@ from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.round_trip import ask, echo_on, values_of
 from rce_fleet.experiments.streaming import Part, Streaming
-from rce_fleet.experiments.systems.base import Flow, Layout, Workload, of_each
+from rce_fleet.experiments.systems.base import Flow, Layout, Workload
 from rce_fleet.experiments.workloads.control import QUIET
 from rce_fleet.experiments.workloads.echo import KIND
 from rce_fleet.experiments.workloads.robots import SCAN
@@ -134,6 +134,5 @@ def shares(robots: list[int]) -> list[list[int]]:
 
 async def ready_at(listeners: list[RunningWorkload]) -> float:
     """Return when all listeners had heard of all their robots, seconds since 1970."""
-    lines = await of_each(listeners, lambda listener: listener.lines())
-    found = [report for own in lines for report in reports(own)]
+    found = [report for listener in listeners for report in reports(await listener.lines())]
     return max(float(report[READY]) for report in found if READY in report)

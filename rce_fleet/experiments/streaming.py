@@ -24,7 +24,6 @@ from rce_fleet.experiments.measures import (
     over_time,
     used,
 )
-from rce_fleet.experiments.systems.base import of_each
 from rce_fleet.experiments.workloads.control import END, NOTHING, Phase, give
 from rce_fleet.experiments.workloads.telling import reports
 
@@ -150,7 +149,8 @@ class Streaming:
         Raises:
             ExperimentError: A program ended, or did not tell what it had seen.
         """
-        await self._wait_ready()
+        for listener in self._listeners:
+            await listener.wait_ready()
         waits = any(part.is_whole for part in parts)
         if waits:
             give(self._control, PAUSE)
@@ -175,7 +175,8 @@ class Streaming:
             ExperimentError: A program ended, or did not tell what it had sent.
         """
         name = f"trial-{next(self._trials)}"
-        await self._wait_ready()
+        for listener in self._listeners:
+            await listener.wait_ready()
         watched = await self._watch(name, part, seconds)
         give(self._control, PAUSE)
         deadline = time.monotonic() + DRAIN_S
@@ -187,9 +188,6 @@ class Streaming:
         stamps = [one[0] for samples in found.values() for one in samples]
         inside = sum(begin <= stamp * MICRO < end for stamp in stamps)
         return inside / (end - begin) / len(found)
-
-    async def _wait_ready(self) -> None:
-        await of_each(self._listeners, lambda listener: listener.wait_ready())
 
     async def _told_so_far(self) -> list[dict[str, object]]:
         return [report for source in self._sources for report in reports(await source.lines())]
@@ -242,8 +240,7 @@ class Streaming:
             meter.limit(cores)
 
     async def _told(self, workloads: Sequence[RunningWorkload]) -> list[dict[str, object]]:
-        found = await of_each(workloads, lambda workload: told(workload, DRAIN_S))
-        return list(chain.from_iterable(found))
+        return list(chain.from_iterable([await told(workload, DRAIN_S) for workload in workloads]))
 
 
 def values_of(

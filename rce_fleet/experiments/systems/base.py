@@ -7,24 +7,19 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, ClassVar
 
 from rce.aio.tasks import errors_in
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, client
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+    from collections.abc import Coroutine, Iterator, Sequence
 
     from rce_fleet.experiments.bench import Bench, Program
     from rce_fleet.experiments.systems.software import Software
 
-T = TypeVar("T")
-Item = TypeVar("Item")
-
 PATIENCE_S = 60.0
-AT_ONCE = 4
-"""How many programs are asked at the same time: each question starts a process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,23 +278,6 @@ async def together(*works: Coroutine[object, object, object]) -> None:
                 tasks.create_task(work)
     except* (ExperimentError, OSError) as errors:
         raise next(errors_in(errors)) from None
-
-
-async def of_each(items: Sequence[Item], work: Callable[[Item], Awaitable[T]]) -> list[T]:
-    """Do the same with each item, with some of them at the same time; return the results in their order.
-
-    Raises:
-        ExperimentError, OSError: It cannot be done with one of them; the others are cancelled.
-    """
-    gate = asyncio.Semaphore(AT_ONCE)
-    found: dict[int, T] = {}
-
-    async def do(place: int, item: Item) -> None:
-        async with gate:
-            found[place] = await work(item)
-
-    await together(*(do(place, item) for place, item in enumerate(items)))
-    return [found[place] for place in range(len(items))]
 
 
 def core_uri(address: str) -> str:
