@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 import zlib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -17,6 +17,7 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, DELAY_S, RATE, SERVER, Bench
 from rce_fleet.experiments.clock_watch import ClockWatch
 from rce_fleet.experiments.experiment import Experiment, Link, Options, Trial
+from rce_fleet.experiments.machine_work import WORK, processor_time, work_condition
 from rce_fleet.experiments.results import NOT_ANY, Condition, Row, error_text, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 from rce_fleet.experiments.systems.base import together
@@ -186,6 +187,8 @@ class Runner:
         self._preparing = asyncio.Lock()
         self._writing = asyncio.Lock()
         """Held while the rows of a run are written: they stay together."""
+        self._worked: Counter[Condition] = Counter()
+        """How often the time of the machine's work was taken in each round."""
 
     def rows(self) -> list[Row]:
         """Return the raw data so far.
@@ -209,6 +212,7 @@ class Runner:
         await self._prepare_software()
         await self._measure_link()
         rows = self.rows()
+        self._worked.update(row.condition for row in rows if row.metric == WORK)
         pace = Pace(sum(self._plan.seconds(one, rows) for one in self._plan.experiments))
         by_lanes: dict[int, list[tuple[Work, str]]] = {}
         for experiment in self._plan.experiments:
@@ -246,6 +250,8 @@ class Runner:
             work, place = waiting.popleft()
             prepared = await self._prepare(work.experiment, pace)
             self._say(f"{_named(work)} ({place}; about {pace.left() / 60:.0f} min left)")
+            if self._plan.at_once(work.experiment) == 1 and work.run.number != WARM_UP:
+                await self._measure_machine(work.run.number)
             await self._do(work, prepared)
             pace.done(self._plan.run_seconds(work))
 
@@ -314,6 +320,18 @@ class Runner:
             write_rows(self._table, [Row(condition, 1, *value) for value in values])
             found = {value.metric: value.value for value in values}
         return found
+
+    async def _measure_machine(self, number: int) -> None:
+        """Take the time of the machine's work before a run; not while other runs are under way.
+
+        Args:
+            number: Of the round.
+        """
+        condition = work_condition(number)
+        seconds = await asyncio.to_thread(processor_time)
+        self._worked[condition] += 1
+        row = Row(condition, self._worked[condition], WORK, seconds, "s")
+        await asyncio.to_thread(write_rows, self._table, [row])
 
     async def _measure_link(self) -> None:
         """Measure the shaped links, in both directions."""

@@ -67,7 +67,7 @@ def cells_of_experiments(page: str) -> Iterator[Cell]:
     for table in tables_of(page):
         if table.head[:2] != ["system", "software"] or table.head[-1] != "runs":
             continue
-        experiment = _experiment_of(page, table.heading)
+        experiment = _experiment_of(page, table)
         titled = re.search(r"\(`(\w+)`\)(?:\*\*|</summary>)", table.about)
         for line in table.rows:
             factors = {name: line[name] for name in table.head[2:-1] if not name.startswith("`")}
@@ -138,9 +138,8 @@ def _unit_of(column: str) -> tuple[str, str]:
     return found[1], found[2] or ""
 
 
-def _experiment_of(page: str, heading: str) -> str:
-    if heading == "## How it was measured":
-        return "link"
-    found = re.search(rf"^{re.escape(heading)}\n\nExperiment `([^`]+)`", page, re.MULTILINE)
-    assert found, heading
+def _experiment_of(page: str, table: Table) -> str:
+    of_section = rf"^{re.escape(table.heading)}\n\nExperiment `([^`]+)`"
+    found = re.search(r"\(experiment `(\w+)`\)", table.about) or re.search(of_section, page, re.MULTILINE)
+    assert found, table.heading
     return found[1]

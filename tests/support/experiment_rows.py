@@ -49,7 +49,8 @@ def example_rows(software: Iterable[str] = ("ros", "rce"), spread: Iterable[floa
     found = [row for name in software for make in _EXAMPLES for row in make(name, spread)]
     link = {"round_trip": (0.0021, "s"), "round_trip_p99": (0.004, "s")}
     link |= {"rate": (2.4e7, "bit/s"), "rate_back": (2.3e7, "bit/s")}
-    return found + rows_of(Condition.of("link", "-", "-", delay=0), {**link, "lost": (0.0, "share")}, spread)
+    found += rows_of(Condition.of("link", "-", "-", delay=0), {**link, "lost": (0.0, "share")}, spread)
+    return found + rows_of(Condition.of("machine", "-", "-", round=1), {"work": (0.05, "s")}, spread)
 
 
 def _traffic(rate: float, message: float, share: float) -> dict[str, tuple[float, str]]:

@@ -15,6 +15,8 @@ from rce_fleet.experiments.report.claims_part import cases, verdicts
 from rce_fleet.experiments.report.figures import figures_of
 from rce_fleet.experiments.report.measurements import Measurements
 from rce_fleet.experiments.report.parts import (
+    LINK,
+    MACHINE,
     differences_table,
     environment_table,
     environments_of,
@@ -23,10 +25,10 @@ from rce_fleet.experiments.report.parts import (
     rows_of,
     write_environments,
 )
-from rce_fleet.experiments.report.repeat import compare
-from rce_fleet.experiments.report.repeat_part import comparison_text
+from rce_fleet.experiments.report.repeat import compare, machine_work
+from rce_fleet.experiments.report.repeat_part import comparison_text, machine_text
 from rce_fleet.experiments.report.schematics import schematics
-from rce_fleet.experiments.report.sections import LINK, READING, SECTIONS, limits
+from rce_fleet.experiments.report.sections import LINK_TABLE, MACHINE_TABLE, READING, SECTIONS, limits
 from rce_fleet.experiments.report.summary import Summary, read_summary, summarize, write_summary
 from rce_fleet.experiments.report.tables import folded, metric_table, table_of, unlisted
 
@@ -42,7 +44,8 @@ SECOND = "second"
 ENVIRONMENTS = "environments.json"
 """What the summary's raw data depend on, beside it."""
 NOT_MEASURED = "Not measured."
-_LINK = "link"
+_BESIDE = {LINK: LINK_TABLE, MACHINE: MACHINE_TABLE}
+"""Tables of what is measured beside the experiments."""
 _ANALYSES = {"scaling": breaking_table, "offload": break_even_table}
 """Tables that say what follows from an experiment's medians."""
 
@@ -163,7 +166,9 @@ it. All medians are in [{SUMMARY}]({figures}/{SUMMARY})."""
 
 def _measured(measurements: Measurements, environments: Mapping[str, Mapping[str, Any]]) -> str:
     parts = [environment_table(environments)]
-    parts.append(table_of(measurements, _LINK, LINK) or f"The link (experiment `{_LINK}`): not measured.")
+    parts += [
+        table_of(measurements, name, spec) or f"{spec.title}: not measured." for name, spec in _BESIDE.items()
+    ]
     if measurements.retried:
         parts.append(f"Runs that were tried more than once (`tries`): {measurements.retried}.")
     return "\n\n".join(parts)
@@ -194,14 +199,14 @@ def _pictures(drawings: Iterable[Drawing], figures: str) -> str:
 
 def _other(measurements: Measurements) -> str:
     """List what no section shows, and the values that were left out."""
-    known = {section.experiment for section in SECTIONS} | {_LINK}
+    known = {section.experiment for section in SECTIONS} | _BESIDE.keys()
     further = [
         wanted
         for experiment in measurements.experiments
         if experiment not in known
         for wanted in unlisted(measurements, experiment, ())
     ]
-    further += unlisted(measurements, _LINK, (LINK,))
+    further += [one for name, spec in _BESIDE.items() for one in unlisted(measurements, name, (spec,))]
     parts = [
         folded("Further experiments and metrics", table)
         if (table := metric_table(measurements, further))
@@ -224,6 +229,8 @@ def _repeated(
     if again is None:
         return NOT_MEASURED
     where = f"Medians of the second run are in [{SECOND}/{SUMMARY}]({figures}/{SECOND}/{SUMMARY})."
-    compared = comparison_text(compare(summarize(measurements), again.summary))
+    first = summarize(measurements)
     differences = differences_table(environments, again.environments)
-    return "\n\n".join(filter(None, (where, differences, compared)))
+    machine = machine_text(machine_work(first), machine_work(again.summary))
+    compared = comparison_text(compare(first, again.summary))
+    return "\n\n".join(filter(None, (where, differences, machine, compared)))

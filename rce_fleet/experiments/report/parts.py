@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 TABLE = "results.csv"
 ENVIRONMENT = "environment.json"
 LINK = "link"
-"""What each folder has measured first, beside its experiments."""
+MACHINE = "machine"
+BESIDE = frozenset({LINK, MACHINE})
+"""What each folder has measured beside its experiments."""
+SET_UP = ("machine", "processor", "cores", "memory_bytes", "kernel", "python", "cpu_shares", "versions")
+"""What must be the same in two runs, by its name in the description, or not only chance differs."""
 MISSING = "-"
 
 
@@ -61,7 +65,9 @@ class Part:
         """Its experiments with the software of each, in the order in which they were done."""
         pairs = ((row.condition.experiment, row.condition.software) for row in self.rows)
         return list(
-            dict.fromkeys((experiment, software) for experiment, software in pairs if experiment != LINK)
+            dict.fromkeys(
+                (experiment, software) for experiment, software in pairs if experiment not in BESIDE
+            )
         )
 
     def title(self, shared: Collection[str]) -> str:
@@ -96,11 +102,11 @@ def read_parts(folders: Sequence[Path]) -> list[Part]:
 
 
 def rows_of(parts: Sequence[Part]) -> list[Row]:
-    """Return the rows of all parts; their measurements of the same link count as runs, one for each part."""
+    """Return the rows of all parts; all measurements of the same link, and of the machine, count as runs."""
     rows = []
     runs: Counter[tuple[object, str]] = Counter()
     for row in (row for part in parts for row in part.rows):
-        if row.condition.experiment == LINK:
+        if row.condition.experiment in BESIDE:
             key = (row.condition, row.metric)
             runs[key] += 1
             rows.append(replace(row, run=runs[key]))
@@ -137,10 +143,25 @@ def differences_table(first: Mapping[str, Mapping[str, Any]], second: Mapping[st
     """
     if not first or not second:
         return ""
+    rows = _differences(first, second)
+    if not rows:
+        return ""
+    table = markdown(("what differs", "first run", "second run"), rows)
+    other = [f"`{row[0]}`" for row in rows if row[0] in SET_UP]
+    if not other:
+        return table
+    return (
+        f"{table}\n\nThe two runs were not made with the same {', '.join(other)}: how well they agree "
+        "does not tell how well a run repeats itself."
+    )
+
+
+def _differences(
+    first: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, Any]]
+) -> list[list[str]]:
     names = dict.fromkeys(name for part in (*first.values(), *second.values()) for name in part)
     found = ([name, *(_values(name, run) for run in (first, second))] for name in names)
-    rows = [row for row in found if row[1] != row[2]]
-    return markdown(("what differs", "first run", "second run"), rows) if rows else ""
+    return [row for row in found if row[1] != row[2]]
 
 
 def _values(name: str, parts: Mapping[str, Mapping[str, Any]]) -> str:

@@ -22,9 +22,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan, nan
+from statistics import median
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import condition_order, scale_for, scaled
+from rce_fleet.experiments.report.parts import MACHINE
 from rce_fleet.experiments.statistics import RepeatShares, repeat_shares
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 
 GOAL = 0.9
 """Share of the medians that must lie in the first run's intervals."""
+WORK = "work"
+"""Metric of the computer itself, which is no result: it does not count as one."""
 NEAR = 0.05
 """A median outside of the interval is near if it differs from the first one by this share at most."""
 
@@ -185,7 +189,17 @@ def compare(first: Iterable[Summary], second: Iterable[Summary]) -> Comparison:
     )
 
 
+def machine_work(summaries: Iterable[Summary]) -> float:
+    """Return the processor time of the computer's work, seconds: the median of the rounds; NaN: none."""
+    found = [one.estimate.median for one in summaries if _is_machine(one) and one.metric == WORK]
+    return median(found) if found else nan
+
+
+def _is_machine(summary: Summary) -> bool:
+    return summary.condition.experiment == MACHINE
+
+
 def _by_name(summaries: Iterable[Summary]) -> dict[object, Summary]:
-    kept = (one for one in summaries if "@" not in one.metric)
+    kept = (one for one in summaries if "@" not in one.metric and not _is_machine(one))
     ordered = sorted(kept, key=lambda one: (condition_order(one.condition), one.metric))
     return {(one.condition, one.metric): one for one in ordered}

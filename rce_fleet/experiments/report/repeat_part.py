@@ -10,6 +10,7 @@ from rce_fleet.experiments.report.labels import (
     factors_label,
     interval,
     scale_for,
+    scaled,
     software_label,
     system_label,
 )
@@ -22,6 +23,23 @@ if TYPE_CHECKING:
 
 CHANCE = "by chance"
 """Column that tells whether chance alone can put a median there: whether it lies in the wider interval."""
+
+
+def machine_text(first: float, second: float) -> str:
+    """Return how fast the computer itself was in the second run; empty if one of them did not measure that.
+
+    Args:
+        first: Processor time of the same work in the first run, seconds.
+        second: In the second run.
+    """
+    if isnan(first) or isnan(second):
+        return ""
+    scale = scale_for("s", [first])
+    return (
+        f"The computer itself did the same work in {scaled(first, scale)} {scale.unit} of processor time in "
+        f"the first run and in {scaled(second, scale)} {scale.unit} in the second one "
+        f"({100 * (second / first - 1):+.1f} %; medians of the rounds)."
+    )
 
 
 def comparison_text(comparison: Comparison) -> str:

@@ -164,9 +164,11 @@ SECTIONS = (
         ),
     ),
 )
-LINK = TableSpec(
-    "The link as measured", _quantities("round_trip", "round_trip_p99", "rate", "rate_back", "lost")
+LINK_TABLE = TableSpec(
+    "The link as measured (experiment `link`)",
+    _quantities("round_trip", "round_trip_p99", "rate", "rate_back", "lost"),
 )
+MACHINE_TABLE = TableSpec("The computer's speed as measured (experiment `machine`)", _quantities("work"))
 
 READING = f"""\
 - *Median and interval.* `7.50 [7.41, 7.62]` is the median of the runs and its {100 * CONFIDENCE:.0f} %

@@ -19,6 +19,7 @@ from rce_fleet.experiments.catalogue import EXPERIMENTS
 from rce_fleet.experiments.command import QUICK_ROBOTS, QUICK_SECONDS
 from rce_fleet.experiments.experiment import Experiment, Link, Measured, Options, Trial
 from rce_fleet.experiments.folders import RUNS as RUNS_OF_ALL
+from rce_fleet.experiments.machine_work import WORK, processor_time, work_condition
 from rce_fleet.experiments.machines import LinkFigures
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
@@ -149,8 +150,19 @@ async def test_each_setup_is_warmed_up_and_run(tmp_path: Path) -> None:
     assert set(eyes) == {Condition.of("dice", one, "rce", colour="red") for one in OPTIONS.systems}
     assert all(len(values) == RUNS for values in eyes.values()), "warm-ups do not count"
     assert sum(row.metric == DONE for row in rows) == len(OPTIONS.systems) * RUNS
+    work = {key: values for key, values in by_condition(rows, WORK).items() if all(values)}
+    assert {key: len(values) for key, values in work.items()} == {
+        work_condition(number): len(OPTIONS.systems) for number in (1, 2)
+    }
     assert said[0] == "dice: preparing"
     assert said[1].endswith("warm-up (1 of 6; about 1 min left)")
+
+
+def test_work_of_the_machine_uses_processor_time_of_its_thread() -> None:
+    """That of other threads and processes does not count, nor does waiting."""
+    before = time.thread_time()
+    found = processor_time()
+    assert 0 < found <= time.thread_time() - before
 
 
 async def test_only_what_is_missing_is_done_again(tmp_path: Path) -> None:
@@ -165,7 +177,8 @@ async def test_only_what_is_missing_is_done_again(tmp_path: Path) -> None:
     assert [trial.setup for trial in dice.trials] == [lost.condition] * 2, "its warm-up, and the run"
     assert dice.prepared == 0, "it is in the table"
     again = read_rows(tmp_path / TABLE)
-    assert sorted(row.metric for row in again) == sorted(row.metric for row in done)
+    assert [row.run for row in again if row.metric == WORK] == [1, 2, 3], "one more before the run"
+    assert sorted(row.metric for row in again) == sorted([*(row.metric for row in done), WORK])
     assert by_condition(again, "eyes") == by_condition(done, "eyes"), "a run has the same seed again"
 
     await runner(tmp_path, dice, said, runs=1).run()
@@ -277,6 +290,7 @@ async def test_runs_that_may_be_are_done_at_once(tmp_path: Path, meeting: Meetin
     assert [row.metric for row in rows].count(DONE) == len(OPTIONS.systems) * RUNS
     runs = [(row.condition.system, row.run) for row in rows]
     assert [key for key, _ in groupby(runs)] == list(dict.fromkeys(runs))
+    assert not by_condition(read_rows(tmp_path / TABLE), WORK), "other runs would be measured with it"
 
 
 class Stuck(Dice):

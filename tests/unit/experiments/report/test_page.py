@@ -6,6 +6,7 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -249,11 +250,33 @@ def test_second_run_is_compared(rows: list[Row]) -> None:
     assert "the goal of 90 % is reached" in text
 
 
+def test_speed_of_the_computer_is_told_and_is_no_result(rows: list[Row]) -> None:
+    """It explains why processor times differ; as a median that differs it would count twice."""
+    slower = [replace(one, value=1.2 * one.value) if one.metric == "work" else one for one in rows]
+    again = OtherRun(summarize(Measurements.of(slower)), {})
+    text = page_text(Measurements.of(rows), {}, {}, "images", again)
+    assert "the same work in 50.0 ms of processor time in the first run and in 60.0 ms in the second" in text
+    assert "(+20.0 %; medians of the rounds)" in text
+    assert "100 % lie in the intervals of the first one" in text
+    former = OtherRun([one for one in again.summary if one.metric != "work"], {})
+    assert "same work" not in page_text(Measurements.of(rows), {}, {}, "images", former)
+
+
+@pytest.mark.parametrize(("name", "tells"), [("python", True), ("versions", True), ("started", False)])
+def test_runs_with_other_software_are_not_the_same_set_up(rows: list[Row], name: str, *, tells: bool) -> None:
+    again = OtherRun(summarize(Measurements.of(rows)), {"value": {name: "3.11.2"}})
+    text = page_text(Measurements.of(rows), {"value": {name: "3.11.7"}}, {}, "images", again)
+    assert f"| {name} | 3.11.7 | 3.11.2 |" in text
+    assert (f"The two runs were not made with the same `{name}`: " in text) is tells
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     folder = tmp_path / "raw"
     folder.mkdir()
-    few = [row for row in example_rows(["ros"]) if row.condition.experiment in {"robustness", "link"}]
+    few = [
+        row for row in example_rows(["ros"]) if row.condition.experiment in {"robustness", "link", "machine"}
+    ]
     write_rows(folder / "results.csv", few)
     about = {
         "cores": 2,
@@ -351,7 +374,7 @@ def test_page_of_several_folders_has_each_experiment_with_its_circumstances(
     monkeypatch.setattr(drawing, "can_draw", lambda: False)
     other = tmp_path / "other"
     other.mkdir()
-    kept = {"laser", "images", "link"}
+    kept = {"laser", "images", "link", "machine"}
     write_rows(
         other / "results.csv", [one for one in example_rows(["ros"]) if one.condition.experiment in kept]
     )
@@ -367,8 +390,9 @@ def test_page_of_several_folders_has_each_experiment_with_its_circumstances(
     for section in SECTIONS:
         measured = section.experiment in {"robustness", "laser", "images"}
         assert (f"{section.text}\n\nNot measured." in text) is not measured
-    (link,) = (one for one in tables if one.about == "**The link as measured**")
-    assert link.rows[0]["runs"] == "6", "three of each folder"
+    for what in ("link", "machine"):
+        (table,) = (one for one in tables if f"(experiment `{what}`)" in one.about)
+        assert table.rows[0]["runs"] == "6", "three of each folder"
 
 
 def test_page_has_the_software_of_each_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
