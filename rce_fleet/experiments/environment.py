@@ -51,7 +51,7 @@ def describe(options: Options, seed: int, runs: int) -> dict[str, Any]:
         "commit": commit(),
         "seed": seed,
         "runs": runs,
-        "started": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        "started": now(),
         "options": {
             "systems": list(options.systems),
             "software": list(options.software),
@@ -60,6 +60,11 @@ def describe(options: Options, seed: int, runs: int) -> dict[str, Any]:
             "quick": options.quick,
         },
     }
+
+
+def now() -> str:
+    """Return the time as descriptions tell it, in UTC: ``2026-11-30T19:00:29+00:00``."""
+    return dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
 
 
 def write(folder: Path, description: dict[str, Any]) -> None:

@@ -83,7 +83,7 @@ def used_alone(folder: Path) -> Iterator[None]:
 
 
 def go_on(folder: Path, former: dict[str, Any], planned: Plan) -> None:
-    """Make sure that machines can be made, and note how many runs there will be.
+    """Make sure that machines can be made, and note how many runs there will be, and that it went on now.
 
     Args:
         folder: With the raw data so far.
@@ -95,8 +95,9 @@ def go_on(folder: Path, former: dict[str, Any], planned: Plan) -> None:
         OSError: The folder cannot be written.
     """
     asyncio.run(check_machines())
-    if planned.runs > runs_of(former):
-        environment.write(folder, {**former, "runs": planned.runs})
+    runs = max(planned.runs, runs_of(former))
+    resumed = [*_resumed(former), environment.now()]
+    environment.write(folder, {**former, "runs": runs, "resumed": resumed})
 
 
 def former_of(folder: Path) -> dict[str, Any]:
@@ -156,6 +157,11 @@ def check_same(folder: Path, former: dict[str, Any], planned: Plan) -> None:
                 f"--resume {folder}: its {key} is {_shown(former.get(key))}, now it is "
                 f"{_shown(description[key])}; data of both cannot be in one table"
             )
+
+
+def _resumed(former: dict[str, Any]) -> list[Any]:
+    found = former.get("resumed", [])
+    return found if isinstance(found, list) else []
 
 
 def _shown(value: object) -> str:

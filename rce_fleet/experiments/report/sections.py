@@ -206,10 +206,10 @@ def limits() -> str:
 - The robots are simulated, and the scans and images are made by programs.
 - The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
   verdict is about the versions above.
-- All runs of an experiment were made on one computer in one session: the intervals say how well it repeats
-  itself, not how other computers differ. Where nothing but chance differs, some
-  {100 * repeat_shares(10, 10).estimate:.0f} % of the medians of another ten runs lie in the intervals; what
-  another full run found is told above.
+- All runs of an experiment were made on one computer, at the hours told above (`started`, `resumed`): the
+  intervals say how well it repeats itself in these, not how other computers and hours differ. Where
+  nothing but chance differs, some {100 * repeat_shares(10, 10).estimate:.0f} % of the medians of another ten
+  runs lie in the intervals; what another full run found is told above.
 - An interval of ten runs has the true median in some 96 of 100 experiments. That of three runs reaches from
   the least to the greatest value: such a range has the true median in 75 of 100 experiments, and the median
   of another three runs in 60. Among so many comparisons, some differ by chance; so a verdict needs a

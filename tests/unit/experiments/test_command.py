@@ -151,3 +151,15 @@ def test_the_commit_is_not_that_of_a_repository_around_it(tmp_path: Path) -> Non
 def test_the_description_has_all_runs_that_were_asked_for(data: Path, runs: int, noted: int) -> None:
     go_on(data, environment.read(data), Plan([], _options(SYSTEMS, "rce", 5, quick=False), runs, seed=1))
     assert environment.read(data)["runs"] == noted
+
+
+@pytest.mark.slow
+@pytest.mark.needs("netns")
+def test_the_description_has_each_time_at_which_it_went_on(data: Path) -> None:
+    """Runs of other hours are in the same table then: the computer may have been faster or slower."""
+    for count in (1, 2):
+        former = environment.read(data)
+        go_on(data, former, Plan([], _options(SYSTEMS, "rce", 5, quick=False), 5, seed=1))
+        resumed = environment.read(data)["resumed"]
+        assert len(resumed) == count
+        assert former["started"] <= resumed[-1] <= environment.now()
