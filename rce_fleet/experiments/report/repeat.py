@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 GOAL = 0.9
 """Share of the medians that must lie in the first run's intervals."""
 WORK = "work"
-"""Metric of the computer itself, which is no result: it does not count as one."""
+"""Metric of the computer itself: it explains results and does not count as one."""
 NEAR = 0.05
 """A median outside of the interval is near if it differs from the first one by this share at most."""
 

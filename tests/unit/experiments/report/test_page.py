@@ -250,7 +250,7 @@ def test_second_run_is_compared(rows: list[Row]) -> None:
     assert "the goal of 90 % is reached" in text
 
 
-def test_speed_of_the_computer_is_told_and_is_no_result(rows: list[Row]) -> None:
+def test_speed_of_the_computer_is_told_and_not_counted(rows: list[Row]) -> None:
     """It explains why processor times differ; as a median that differs it would count twice."""
     slower = [replace(one, value=1.2 * one.value) if one.metric == "work" else one for one in rows]
     again = OtherRun(summarize(Measurements.of(slower)), {})
