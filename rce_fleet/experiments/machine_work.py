@@ -12,11 +12,8 @@ import zlib
 from functools import cache
 from random import Random
 
-from rce_fleet.experiments.results import NOT_ANY, Condition
+from rce_fleet.experiments.results import MACHINE, NOT_ANY, Condition
 
-WORK = "work"
-"""Metric: processor time of the work, seconds."""
-EXPERIMENT = "machine"
 ROUND = "round"
 """Factor: the round of runs in which the work was done."""
 _SIZE = 1 << 18
@@ -26,7 +23,7 @@ _LEVEL = 6
 
 def work_condition(number: int) -> Condition:
     """Return the condition of the work's times in a round of runs."""
-    return Condition.of(EXPERIMENT, NOT_ANY, NOT_ANY, **{ROUND: number})
+    return Condition.of(MACHINE, NOT_ANY, NOT_ANY, **{ROUND: number})
 
 
 def processor_time() -> float:

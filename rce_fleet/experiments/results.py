@@ -21,6 +21,14 @@ if TYPE_CHECKING:
 
 NOT_ANY = "-"
 """System or software of a condition that has none."""
+LINK = "link"
+"""Experiment of what is measured of the links themselves."""
+MACHINE = "machine"
+"""Experiment of what is measured of the computer itself."""
+BESIDE = frozenset({LINK, MACHINE})
+"""What each folder of raw data has measured beside its experiments."""
+WORK = "work"
+"""Metric of the computer itself: processor time of a piece of work that is always the same, seconds."""
 COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
 
 

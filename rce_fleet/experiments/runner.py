@@ -17,8 +17,17 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, DELAY_S, RATE, SERVER, Bench
 from rce_fleet.experiments.clock_watch import ClockWatch
 from rce_fleet.experiments.experiment import Experiment, Link, Options, Trial
-from rce_fleet.experiments.machine_work import WORK, processor_time, work_condition
-from rce_fleet.experiments.results import NOT_ANY, Condition, Row, error_text, read_rows, write_rows
+from rce_fleet.experiments.machine_work import processor_time, work_condition
+from rce_fleet.experiments.results import (
+    LINK,
+    NOT_ANY,
+    WORK,
+    Condition,
+    Row,
+    error_text,
+    read_rows,
+    write_rows,
+)
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 from rce_fleet.experiments.systems.base import together
 from rce_fleet.experiments.systems.software import software_of
@@ -35,7 +44,6 @@ DONE = "done"
 PREPARED = "prepared"
 SAMPLE_S = 60.0
 """Planned time of what must be done until its pace counts for the rest."""
-LINK = "link"
 USUAL_LINKS = tuple(Link(RATE / 1e6, delay) for delay in (1000 * DELAY_S, 0.0, 20.0))
 """Links that are measured before all experiments; quickly, the first one only."""
 LINK_UNITS = {"round_trip": "s", "round_trip_p99": "s", "lost": "", "rate": "bit/s", "rate_back": "bit/s"}

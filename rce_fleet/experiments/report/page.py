@@ -15,8 +15,6 @@ from rce_fleet.experiments.report.claims_part import cases, verdicts
 from rce_fleet.experiments.report.figures import figures_of
 from rce_fleet.experiments.report.measurements import Measurements
 from rce_fleet.experiments.report.parts import (
-    LINK,
-    MACHINE,
     differences_table,
     environment_table,
     environments_of,
@@ -31,6 +29,7 @@ from rce_fleet.experiments.report.schematics import schematics
 from rce_fleet.experiments.report.sections import LINK_TABLE, MACHINE_TABLE, READING, SECTIONS, limits
 from rce_fleet.experiments.report.summary import Summary, read_summary, summarize, write_summary
 from rce_fleet.experiments.report.tables import folded, metric_table, table_of, unlisted
+from rce_fleet.experiments.results import LINK, MACHINE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

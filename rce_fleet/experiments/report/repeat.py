@@ -26,7 +26,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import condition_order, scale_for, scaled
-from rce_fleet.experiments.report.parts import MACHINE
+from rce_fleet.experiments.results import MACHINE, WORK
 from rce_fleet.experiments.statistics import RepeatShares, repeat_shares
 
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 GOAL = 0.9
 """Share of the medians that must lie in the first run's intervals."""
-WORK = "work"
-"""Metric of the computer itself: it explains results and does not count as one."""
 NEAR = 0.05
 """A median outside of the interval is near if it differs from the first one by this share at most."""
 

@@ -19,10 +19,10 @@ from rce_fleet.experiments.catalogue import EXPERIMENTS
 from rce_fleet.experiments.command import QUICK_ROBOTS, QUICK_SECONDS
 from rce_fleet.experiments.experiment import Experiment, Link, Measured, Options, Trial
 from rce_fleet.experiments.folders import RUNS as RUNS_OF_ALL
-from rce_fleet.experiments.machine_work import WORK, processor_time, work_condition
+from rce_fleet.experiments.machine_work import processor_time, work_condition
 from rce_fleet.experiments.machines import LinkFigures
 from rce_fleet.experiments.measures import Value
-from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
+from rce_fleet.experiments.results import WORK, Condition, Row, by_condition, read_rows, write_rows
 from rce_fleet.experiments.runner import (
     DONE,
     SAMPLE_S,
