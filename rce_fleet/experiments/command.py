@@ -27,8 +27,8 @@ from rce_fleet.experiments.folders import (
 )
 from rce_fleet.experiments.ownership import measuring, sweep
 from rce_fleet.experiments.report import make_report, read_second
-from rce_fleet.experiments.results import error_text
-from rce_fleet.experiments.runner import TABLE, Plan, Runner
+from rce_fleet.experiments.results import TABLE, error_text
+from rce_fleet.experiments.runner import Plan, Runner
 from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import rce
 from rce_fleet.experiments.ownership import new_tag
+from rce_fleet.experiments.results import ENVIRONMENT
 from rce_fleet.experiments.systems.software import ROSCPP
 from rce_fleet.experiments.usage import make_meter
 
 if TYPE_CHECKING:
     from rce_fleet.experiments.experiment import Options
 
-FILE = "environment.json"
 PACKAGES = ("numpy", "uvloop", "websockets", "aiohttp", "msgspec")
 PROGRAMS = {
     "roscore": ("rosversion", "roslaunch"),
@@ -69,7 +69,7 @@ def now() -> str:
 
 def write(folder: Path, description: dict[str, Any]) -> None:
     """Write a description beside the raw data."""
-    (folder / FILE).write_text(json.dumps(description, indent=2) + "\n")
+    (folder / ENVIRONMENT).write_text(json.dumps(description, indent=2) + "\n")
 
 
 def read(folder: Path) -> dict[str, Any]:
@@ -79,9 +79,9 @@ def read(folder: Path) -> dict[str, Any]:
         OSError: The file cannot be read.
         ValueError: It is not one.
     """
-    found = json.loads((folder / FILE).read_text())
+    found = json.loads((folder / ENVIRONMENT).read_text())
     if not isinstance(found, dict):
-        raise ValueError(f"{folder / FILE} is not a JSON object")  # noqa: TRY004 - it is the file's fault
+        raise ValueError(f"{folder / ENVIRONMENT} is not a JSON object")  # noqa: TRY004 - it is the file's fault
     return found
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments import environment
 from rce_fleet.experiments.machines import check_machines
-from rce_fleet.experiments.results import error_text
+from rce_fleet.experiments.results import ENVIRONMENT, error_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +49,7 @@ def new_folder(planned: Plan, output: Path | None) -> Path:
     """
     folder = output or Path(time.strftime("experiment-%Y%m%d-%H%M%S"))
     if folder.exists():
-        is_started = (folder / environment.FILE).is_file()
+        is_started = (folder / ENVIRONMENT).is_file()
         way = f"go on in it with --resume {folder}" if is_started else "name a new folder"
         raise ExperimentError(f"{folder} exists already; {way}")
     asyncio.run(check_machines())
@@ -110,7 +110,7 @@ def former_of(folder: Path) -> dict[str, Any]:
         return environment.read(folder)
     except (FileNotFoundError, NotADirectoryError):
         raise ExperimentError(
-            f"--resume {folder}: it is not the folder of an experiment, for there is no {environment.FILE}"
+            f"--resume {folder}: it is not the folder of an experiment, for there is no {ENVIRONMENT}"
         ) from None
     except (OSError, ValueError) as error:
         raise ExperimentError(f"--resume {folder}: {error_text(error)}") from error

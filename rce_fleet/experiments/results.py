@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+TABLE = "results.csv"
+"""The table's file in a folder of raw data."""
+ENVIRONMENT = "environment.json"
+"""The file beside it: what the rows depend on."""
 NOT_ANY = "-"
 """System or software of a condition that has none."""
 LINK = "link"
@@ -29,6 +33,10 @@ BESIDE = frozenset({LINK, MACHINE})
 """What each folder of raw data has measured beside its experiments."""
 WORK = "work"
 """Metric of the computer itself: processor time of a piece of work that is always the same, seconds."""
+DONE = "done"
+"""Metric of the last row of a run: how long it took, seconds."""
+TRIED = "tries"
+"""Metric: how often a run was tried until it succeeded."""
 COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
 
 

@@ -19,8 +19,11 @@ from rce_fleet.experiments.clock_watch import ClockWatch
 from rce_fleet.experiments.experiment import Experiment, Link, Options, Trial
 from rce_fleet.experiments.machine_work import processor_time, work_condition
 from rce_fleet.experiments.results import (
+    DONE,
     LINK,
     NOT_ANY,
+    TABLE,
+    TRIED,
     WORK,
     Condition,
     Row,
@@ -38,9 +41,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TABLE = "results.csv"
-DONE = "done"
-"""Metric of the last row of a run: how long it took, seconds."""
 PREPARED = "prepared"
 SAMPLE_S = 60.0
 """Planned time of what must be done until its pace counts for the rest."""
@@ -274,7 +274,7 @@ class Runner:
             return
         rows = [Row(one.condition, run.number, *one.value) for one in measured]
         took = Row(run.condition, run.number, DONE, time.monotonic() - began, "s")
-        attempts = Row(run.condition, run.number, "tries", float(tries), "")
+        attempts = Row(run.condition, run.number, TRIED, float(tries), "")
         async with self._writing:
             await asyncio.to_thread(write_rows, self._table, [*rows, attempts, took])
 

@@ -16,8 +16,7 @@ from support.experiments import TIMEOUT_S, left_behind, run, started
 from rce_fleet.experiments.catalogue import EXPERIMENTS
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Options
 from rce_fleet.experiments.offload import tasks_of
-from rce_fleet.experiments.results import Row, read_rows
-from rce_fleet.experiments.runner import DONE
+from rce_fleet.experiments.results import DONE, Row, read_rows
 
 pytestmark = [
     pytest.mark.e2e,

@@ -11,6 +11,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Self
 
 from rce_fleet.experiments.report.labels import condition_order
+from rce_fleet.experiments.results import DONE, TRIED
 from rce_fleet.experiments.schedule import WARM_UP
 from rce_fleet.experiments.statistics import Estimate, estimate
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.results import Condition, Row
 
 
-BOOKKEEPING = frozenset({"done", "tries"})
+BOOKKEEPING = frozenset({DONE, TRIED})
 """Metrics of runs that say nothing about a system: how long a run took, how often it was tried."""
 SHARES = frozenset({"lost"})
 """Metrics that are shares, 0 .. 1, and have no unit in the table."""
@@ -93,7 +94,7 @@ class Measurements:
         units: dict[tuple[Condition, str], str] = {}
         left_out, retried = [], 0
         for row in rows:
-            retried += row.metric == "tries" and row.value > 1
+            retried += row.metric == TRIED and row.value > 1
             if row.run == WARM_UP or row.metric in BOOKKEEPING:
                 continue
             if not isfinite(row.value):

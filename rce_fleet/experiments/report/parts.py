@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.report.labels import number
 from rce_fleet.experiments.report.tables import markdown
-from rce_fleet.experiments.results import BESIDE, NOT_ANY, Row, read_rows
+from rce_fleet.experiments.results import BESIDE, ENVIRONMENT, NOT_ANY, TABLE, Row, read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
-TABLE = "results.csv"
-ENVIRONMENT = "environment.json"
 SET_UP = ("machine", "processor", "cores", "memory_bytes", "kernel", "python", "cpu_shares", "versions")
 """What must be the same in two runs, by its name in the description, or not only chance differs."""
 MISSING = "-"

@@ -19,8 +19,8 @@ from rce_fleet.experiments.folders import go_on
 from rce_fleet.experiments.laser import Laser
 from rce_fleet.experiments.ownership import measuring
 from rce_fleet.experiments.report import drawing
-from rce_fleet.experiments.results import Row, write_rows
-from rce_fleet.experiments.runner import DONE, USUAL_LINKS, Plan, link_condition
+from rce_fleet.experiments.results import DONE, Row, write_rows
+from rce_fleet.experiments.runner import USUAL_LINKS, Plan, link_condition
 
 SYSTEMS = "single_master,cloud"
 app = typer.Typer()

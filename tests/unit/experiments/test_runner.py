@@ -22,11 +22,19 @@ from rce_fleet.experiments.folders import RUNS as RUNS_OF_ALL
 from rce_fleet.experiments.machine_work import processor_time, work_condition
 from rce_fleet.experiments.machines import LinkFigures
 from rce_fleet.experiments.measures import Value
-from rce_fleet.experiments.results import WORK, Condition, Row, by_condition, read_rows, write_rows
-from rce_fleet.experiments.runner import (
+from rce_fleet.experiments.results import (
     DONE,
-    SAMPLE_S,
     TABLE,
+    TRIED,
+    WORK,
+    Condition,
+    Row,
+    by_condition,
+    read_rows,
+    write_rows,
+)
+from rce_fleet.experiments.runner import (
+    SAMPLE_S,
     USUAL_LINKS,
     Pace,
     Plan,
@@ -337,6 +345,6 @@ async def test_a_run_in_which_the_clock_was_set_is_done_again(tmp_path: Path, st
     assert f"the clock of this machine was set by {step:+.2f} s meanwhile, or the machine slept" in "".join(
         said
     )
-    tries = [row.value for row in read_rows(tmp_path / TABLE) if row.metric == "tries"]
+    tries = [row.value for row in read_rows(tmp_path / TABLE) if row.metric == TRIED]
     assert sorted(tries) == [1.0, 1.0, 1.0, 2.0]
     assert len(dice.trials) == 7, "two warm-ups, four runs, and one of them again"
